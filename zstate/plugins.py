@@ -37,11 +37,11 @@ _LOG = logging.getLogger("zstate")
 class Command(NamedTuple):
     """A command of the command line.
 
-    ``place`` is ``"module:attribute"`` of its click.Command, which is loaded when it is called. The help of
-    zstate lists its own ones with their ``summary``, in a ``section``.
+    ``reference`` is the object reference, ``"module:attribute"``, of its click.Command, which is loaded when
+    it is called. The help of zstate lists its own ones with their ``summary``, in a ``section``.
     """
 
-    place: str
+    reference: str
     section: str = ""
     summary: str = ""
 
@@ -51,7 +51,7 @@ class Plugin:
     """What one folder or package brings.
 
     - ``streams``
-    - ``commands`` of the command line by name: a ``Command``, or only its ``place``.
+    - ``commands`` of the command line by name: a ``Command``, or only its ``reference``.
     - ``synonyms``: commands of other tools, in lower case with underscores, and the commands to call instead,
       separated by " | ": ``{"rosbag": "record | replay"}``. A hint shows them.
     - ``checks``: ``"module:class"`` of what `zstate doctor` checks, a subclass of
@@ -120,8 +120,8 @@ def found_plugins() -> tuple[FoundPlugin, ...]:
             if _is_usable(row, one, problems) and _is_free(row.name, "stream", one, taken, problems)
         ]
         own = {
-            name: place
-            for name, place in one.plugin.commands.items()
+            name: reference
+            for name, reference in one.plugin.commands.items()
             if _is_free(name, "command", one, commands, problems)
         }
         plugin = replace(one.plugin, streams=tuple(streams), commands=own)

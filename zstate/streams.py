@@ -144,8 +144,8 @@ class Stream:
 
     def to_document(self, message: Message, robot: str, *, in_full: bool = False) -> dict[str, Any]:
         """What `zstate echo` prints of ``message``; ``in_full`` for programs."""
-        if place := (in_full and self.full_document) or self.document:
-            return loaded(place)(message, robot)
+        if reference := (in_full and self.full_document) or self.document:
+            return loaded(reference)(message, robot)
         document = {name: getattr(message, name) for name in message.__struct_fields__ if name != "session"}
         if isinstance(frame := document.get("frame"), str):
             with suppress(InvalidInput):  # no name of a frame: as it is

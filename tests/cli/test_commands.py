@@ -12,7 +12,7 @@ FILES = {path.stem for path in (Path(__file__).parents[2] / "zstate/cli/commands
 
 
 def test_every_file_of_commands_is_a_command():
-    core = {name for name, one in own_commands().items() if one.place.startswith("zstate.cli.commands.")}
+    core = {name for name, one in own_commands().items() if one.reference.startswith("zstate.cli.commands.")}
     assert core == FILES
 
 

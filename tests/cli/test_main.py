@@ -71,7 +71,7 @@ def test_every_synonym_leads_to_commands_that_exist():
     for owner, table in (("", main._SYNONYMS), *((one.name, one.synonyms) for one in built_in_plugins())):
         for commands in table.values():
             for command in commands.split(" | "):
-                assert own_commands()[command.split()[0]].place.startswith(f"zstate.{owner or 'cli'}."), (
+                assert own_commands()[command.split()[0]].reference.startswith(f"zstate.{owner or 'cli'}."), (
                     command
                 )
         assert not set(table) & set(own_commands())

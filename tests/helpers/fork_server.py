@@ -170,7 +170,8 @@ def _serve(control: socket.socket) -> Callable[[], None]:
         request = json.loads(_read(control, *_LENGTH.unpack(head)))
         *streams, status = descriptors
         for name in request["imports"]:
-            import_module(name)
+            with suppress(ModuleNotFoundError):  # the program reports it
+                import_module(name)
         with warnings.catch_warnings():  # of threads, as numpy has them; they are ended by fork handlers
             warnings.simplefilter("ignore", DeprecationWarning)
             pid = os.fork()
@@ -210,7 +211,8 @@ def _run(request: dict[str, Any], streams: list[int]) -> None:
 
 def _main() -> None:
     for name in PRELOADED:
-        import_module(name)
+        with suppress(ModuleNotFoundError):  # of a plugin whose folder is removed
+            import_module(name)
     gc.freeze()
     run = _serve(socket.socket(fileno=int(sys.argv[1])))
     run()

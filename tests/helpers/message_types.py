@@ -2,11 +2,10 @@
 
 import importlib
 
-from zstate.driving.messages import MotionOutcome
 from zstate.message import Message
-from zstate.wire.messages import Sample
+from zstate.plugins import built_in_plugins
 
-_PARTS = {Sample, MotionOutcome}
+_PARTS = {"Sample", "MotionOutcome"}
 """Not sent by themselves."""
 
 
@@ -21,7 +20,7 @@ def _types_of(module: str) -> list[type[Message]]:
 
 MESSAGE_TYPES = tuple(
     kind
-    for folder in ("wire", "driving", "odometry", "scans")
+    for folder in ("wire", *(plugin.name for plugin in built_in_plugins() if plugin.streams))
     for kind in _types_of(f"zstate.{folder}.messages")
-    if kind not in _PARTS
+    if kind.__name__ not in _PARTS
 )

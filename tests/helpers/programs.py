@@ -1,4 +1,7 @@
-"""Programs that the commands of a test meet on the network, in the test's own process."""
+"""Programs that the commands of a test meet on the network, in the test's own process.
+
+Those of plugins import them when they start: other tests run without their folders.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +9,15 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from zstate import Transform, TransformPublisher, connect, load_model
 from zstate.clock import SystemClock
-from zstate.driving import DriverHost, Limits, SimulatedDriver
-from zstate.fleet.acl import read_access_control
-from zstate.fleet.router_config import RouterConfig
 from zstate.net.security.credentials import Credentials
 from zstate.rate import Rate
-from zstate.scans import ScanPublisher
-from zstate.scans.simulated_laser import (
-    DUMMY_ANGLE_INCREMENT,
-    DUMMY_ANGLE_MIN,
-    DUMMY_RANGE_MAX,
-    dummy_scan,
-)
+
+if TYPE_CHECKING:
+    from zstate.driving import DriverHost
 
 
 @contextmanager
@@ -29,6 +25,9 @@ def router(
     endpoint: str, *, ros2: bool = False, users: Path | None = None, acl: Path | None = None
 ) -> Iterator[str]:
     """The router of `zstate router` at ``endpoint``, with the same options."""
+    from zstate.fleet.acl import read_access_control
+    from zstate.fleet.router_config import RouterConfig
+
     credentials = None if users is None else Credentials(users=users)
     access = {} if acl is None else read_access_control(acl)
     config = RouterConfig((endpoint,), (), credentials, None, access, ros2)
@@ -39,6 +38,8 @@ def router(
 @contextmanager
 def driver(robot: str = "rrbot", name: str | None = None, *, ttl_s: float = 10.0) -> Iterator[DriverHost]:
     """The driver of `zstate drive sim`, ready; commands are valid for 10 s, as a busy commander may pause."""
+    from zstate.driving import DriverHost, Limits, SimulatedDriver
+
     model = load_model(robot)
     with (
         connect() as session,
@@ -76,25 +77,24 @@ def moving_edge(
             yield
 
 
-class _DummyLaser:
-    def __init__(self, frame: str) -> None:
-        self._frame = frame
-
-    def read(self, stamp: int) -> Any:
-        return dummy_scan(stamp, self._frame)
-
-
 @contextmanager
 def scanner(robot: str, frame: str, sensor: str = "scan", wire: str = "native") -> Iterator[None]:
     """The scans of `zstate scan --dummy`: 30 Hz, 1081 rays."""
+    from zstate.scans import ScanPublisher
+    from zstate.scans import simulated_laser as laser
+
+    class DummyLaser:
+        def read(self, stamp: int) -> Any:
+            return laser.dummy_scan(stamp, publisher.frame)
+
     geometry = {
-        **{"angle_min": DUMMY_ANGLE_MIN, "angle_increment": DUMMY_ANGLE_INCREMENT},
-        **{"range_min": 0.0, "range_max": DUMMY_RANGE_MAX},
+        **{"angle_min": laser.DUMMY_ANGLE_MIN, "angle_increment": laser.DUMMY_ANGLE_INCREMENT},
+        **{"range_min": 0.0, "range_max": laser.DUMMY_RANGE_MAX},
     }
     with (
         connect() as session,
         ScanPublisher(session, robot, sensor, wire, frame=frame, program="laser", **geometry) as publisher,
-        _in_thread(lambda: publisher.run(_DummyLaser(publisher.frame)), publisher.close),
+        _in_thread(lambda: publisher.run(DummyLaser()), publisher.close),
     ):
         yield
 

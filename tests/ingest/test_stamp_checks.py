@@ -88,7 +88,7 @@ def test_threads_share_the_checks(monkeypatch: pytest.MonkeyPatch):
         # Large batches: with single calls, threads rarely meet in the few instructions that need the lock.
         states = [JointState(0, 0, 10**6 * thread + number, b"order", b"") for number in range(20_000)]
         started.wait(60)
-        domain.place("r1", [f"other/{thread}-{number}" for number in range(60_000)])
+        domain.assign("r1", [f"other/{thread}-{number}" for number in range(60_000)])
         for state in states:
             lag.add("r1", None, state, 2 * S)
 

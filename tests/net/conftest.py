@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING
 
 import pytest
-from helpers.access_routers import ROUTERS_PROGRAM, AccessRouters
 from helpers.processes import Child, find_free_port
 
-from zstate.fleet.certificates import issue_identities
+if TYPE_CHECKING:
+    from helpers.access_routers import AccessRouters
 
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AccessRouters]:
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    from helpers.access_routers import ROUTERS_PROGRAM, AccessRouters
+
+    from zstate.fleet.certificates import issue_identities
+
     now, two_days = datetime.now(UTC), timedelta(days=2)
     folder, strangers = tmp_path_factory.mktemp("fleet"), tmp_path_factory.mktemp("strangers")
     issue_identities(folder, ["router", "r1"])

@@ -38,7 +38,7 @@ pytestmark = pytest.mark.skipif(kernel != "c", reason=f"runs on the reference: {
 
 
 def is_ready(publisher: StatePublisher) -> bool:
-    return publisher._path is not None and publisher._path.ready
+    return publisher._publish_path is not None and publisher._publish_path.ready
 
 
 def open_publisher(session: Any, model: Any = RRBOT, **options: Any) -> StatePublisher:
@@ -124,7 +124,7 @@ def test_ros_samples_outside_limits_are_counted(sessions):
 def test_two_wires_take_the_slow_way(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1", wires=("native", "ros2"), takeover=True) as publisher:
         publisher.publish(POSITIONS)
-        assert publisher._path is None
+        assert publisher._publish_path is None
         assert [counts.samples for counts in publisher.stats.streams.values()] == [1, 0, 1, 0]
 
 
@@ -226,7 +226,7 @@ def test_refusals_are_those_of_the_slow_way_and_send_nothing(sessions, arguments
                 publisher.publish(*arguments)
             texts.append(str(caught.value))
             publisher.publish(POSITIONS)
-            publisher._path = None
+            publisher._publish_path = None
         assert texts[0] == texts[1] == publisher.stats.last_refusal
         assert publisher.stats.refused == 2
 
@@ -234,12 +234,12 @@ def test_refusals_are_those_of_the_slow_way_and_send_nothing(sessions, arguments
 @pytest.mark.parametrize("with_path", [True, False])
 def test_a_closed_publisher_or_session_is_refused(with_path: bool):
     with connect() as session, open_publisher(session) as publisher:
-        publisher._path = publisher._path if with_path else None
+        publisher._publish_path = publisher._publish_path if with_path else None
         publisher.close()
         with pytest.raises(Closed, match="the publisher of 'r1' is closed"):
             publisher.publish(POSITIONS)
     with connect() as session, open_publisher(session) as publisher:
-        publisher._path = publisher._path if with_path else None
+        publisher._publish_path = publisher._publish_path if with_path else None
         session.close()
         with pytest.raises(Closed, match="this session is closed"):
             publisher.publish(POSITIONS)

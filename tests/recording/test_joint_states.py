@@ -191,7 +191,7 @@ def test_parts_ascend_and_take_memory_that_does_not_grow_with_the_recording(tmp_
                 builder.joints("arm", log_time - late + n % 2, swing_positions(n), log_time=log_time)
         with Recording(path) as recording:
             tracemalloc.start()
-            stamps = [part.trajectory.stamps.copy() for part in recording.joint_state_reader().parts()]
+            stamps = [part.trajectory.stamps.copy() for part in recording.joint_state_reader().batches()]
             peaks.append(tracemalloc.get_traced_memory()[1] - sum(part.nbytes for part in stamps))
             tracemalloc.stop()
             tracemalloc.start()

@@ -154,7 +154,7 @@ def test_edges_placed_in_frames_of_another_robot_keep_the_clock_of_their_writer(
     buffer = TransformBuffer()
     buffer.set_domain("fleet", "sim")
     buffer.set_domain("r1", "system")
-    buffer.domain.place("fleet", ["r1/odom"])
+    buffer.domain.assign("fleet", ["r1/odom"])
     turn = [0.0, 0.0, 0.0, 1.0]
     buffer.insert(Transform("fleet/map", "r1/odom", [0.0, 0.0, 0.0], turn, NOW))
     buffer.insert(Transform("r1/odom", "r1/base", [0.0, 0.0, 0.0], turn, NOW))

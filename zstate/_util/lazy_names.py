@@ -21,7 +21,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], object
     return load
 
 
-def loaded(place: str) -> Any:
-    """What is at ``"module:name"``; its module is imported if it is not yet."""
-    module, _, name = place.partition(":")
+def loaded(reference: str) -> Any:
+    """What the object reference ``"module:name"`` leads to; its module is imported if it is not yet."""
+    module, _, name = reference.partition(":")
     return getattr(import_module(module), name)

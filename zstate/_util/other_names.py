@@ -88,8 +88,8 @@ def missing_name(package: str, folder: Path, name: str) -> AttributeError:
     hint = ""
     if name in TF2_CLASSES:
         hint = f"; tf2's {name} is {package}.{TF2_CLASSES[name]} here"
-    elif place := _place_of(package, folder, name):
-        hint = f"; it is {place}.{name}"
+    elif module := _module_of(package, folder, name):
+        hint = f"; it is {module}.{name}"
     return AttributeError(f"module {package!r} has no attribute {name!r}{hint}")
 
 
@@ -104,7 +104,7 @@ def missing_method(owner: object, name: str, buffer: object = None) -> Attribute
     return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}{hint}")
 
 
-def _place_of(package: str, folder: Path, name: str) -> str:
+def _module_of(package: str, folder: Path, name: str) -> str:
     """The module of ``package`` that exports ``name``, without loading it; empty without one."""
     import pkgutil  # noqa: PLC0415 - for mistakes alone
     from importlib import import_module  # noqa: PLC0415

@@ -52,7 +52,7 @@ class ClockDomain:
             self._by_robot[robot] = domain
         return before != domain
 
-    def place(self, robot: str, children: Iterable[str]) -> None:
+    def assign(self, robot: str, children: Iterable[str]) -> None:
         """Record that writers of ``robot`` place the frames ``children``."""
         with self._lock:
             for child in children:

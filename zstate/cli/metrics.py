@@ -53,8 +53,8 @@ def serve_metrics(address: BindAddress | None, *rows: AddRows) -> Generator[None
 def plugin_rows(session: Session, robot: str) -> Generator[list[AddRows]]:
     """What plugins measure of ``robot``, or "*", while it is open."""
     with ExitStack() as opened:
-        places = [plugin.metrics for plugin in built_in_plugins() if plugin.metrics]
-        yield [opened.enter_context(loaded(place)(session, robot)).add for place in places]
+        references = [plugin.metrics for plugin in built_in_plugins() if plugin.metrics]
+        yield [opened.enter_context(loaded(reference)(session, robot)).add for reference in references]
 
 
 def publisher_rows(*publishers: SamplePublisher) -> AddRows:

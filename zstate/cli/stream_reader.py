@@ -81,7 +81,7 @@ class StreamReader(Closeable):
         if not waiter.wait_for(self._samples.qsize, timeout_s, self._reason):
             fail(f"gave up after {timeout_s:g} s: {self._reason()}")
         if waiter.last_reason:
-            print_status(f"received {self._directory.messages.place(self.robot, (self._stream,))}")
+            print_status(f"received {self._directory.messages.topics(self.robot, (self._stream,))}")
         return self._samples.get_nowait()
 
     def no_sample_text(self) -> str:

@@ -111,7 +111,7 @@ class CallbackThread(Closeable, Generic[T]):
                         threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-_Place = tuple[str, StreamName, str]
+_StreamKey = tuple[str, StreamName, str]
 
 
 class EventLog(Closeable):
@@ -133,9 +133,9 @@ class EventLog(Closeable):
         # In ROS many programs publish parts of tf, and several may publish a robot's joints.
         self._exclusive = self._streams - {"joint_states", *shared} if shared else self._streams
         self._events: deque[WriterEvent] = deque(maxlen=KEPT)
-        self._alive: dict[_Place, dict[int, Announcement]] = {}
-        self._former: BoundedDict[tuple[_Place, str, str], WriterId] = BoundedDict()
-        self._gone: BoundedDict[tuple[_Place, int], None] = BoundedDict()
+        self._alive: dict[_StreamKey, dict[int, Announcement]] = {}
+        self._former: BoundedDict[tuple[_StreamKey, str, str], WriterId] = BoundedDict()
+        self._gone: BoundedDict[tuple[_StreamKey, int], None] = BoundedDict()
         self._conflicts: BoundedDict[tuple[str, str, int, str], None] = BoundedDict()
         self._owners = StaticEdgeOwners()
         self._lock = fork_safe_lock()
@@ -232,15 +232,15 @@ class EventLog(Closeable):
         return next_s
 
     def _on_joined(self, announced: Announcement) -> None:
-        place, writer = _place(announced), announced.writer
-        others = self._alive.setdefault(place, {})
+        key, writer = _stream_key(announced), announced.writer
+        others = self._alive.setdefault(key, {})
         if writer.session in others:
             return
         rivals = [other.writer for other in others.values() if other.conflicts_with(announced)]
         others[writer.session] = announced
         text = f"{announced.robot!r}: {writer} writes {_what(announced)}"
-        before = self._former.get((place, writer.program, writer.host))
-        if (place, writer.session) in self._gone:
+        before = self._former.get((key, writer.program, writer.host))
+        if (key, writer.session) in self._gone:
             self._add("back", announced.robot, announced.stream, writer, f"{text}: it is back")
         elif before is None or rivals:
             self._add("joined", announced.robot, announced.stream, writer, text)
@@ -254,14 +254,14 @@ class EventLog(Closeable):
         self._deadlines.register((announced.robot, writer.session))
 
     def _on_left(self, announced: Announcement, kind: Literal["left", "cut off"]) -> None:
-        place, writer = _place(announced), announced.writer
-        others = self._alive.get(place, {})
+        key, writer = _stream_key(announced), announced.writer
+        others = self._alive.get(key, {})
         if others.pop(writer.session, None) is None:
             return
-        self._gone[place, writer.session] = None
-        self._former[place, writer.program, writer.host] = writer
+        self._gone[key, writer.session] = None
+        self._former[key, writer.program, writer.host] = writer
         if not others:
-            del self._alive[place]
+            del self._alive[key]
         if not others and announced.stream == "tf_static":
             self._owners.replace((announced.robot, announced.name), frozenset())
         was_stale = self._deadlines.unregister((announced.robot, writer.session))
@@ -305,7 +305,7 @@ class EventLog(Closeable):
             self._thread.submit(event)
 
 
-def _place(announced: Announcement) -> _Place:
+def _stream_key(announced: Announcement) -> _StreamKey:
     return announced.robot, announced.stream, announced.name
 
 

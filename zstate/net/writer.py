@@ -45,7 +45,7 @@ class SampleWriter(KeyPublisher):
     def __init__(self, session: Session, encoder: StreamEncoder) -> None:
         super().__init__(session, encoder.key, encoder.encoding)
         self.encoder = encoder
-        self.path: PublishPath | None = None
+        self.publish_path: PublishPath | None = None
         """The extension's publisher of this writer's usual samples, which counts them; None without it."""
         self._samples = self._bytes = 0
         self._attachment = encoder.attachment
@@ -53,7 +53,7 @@ class SampleWriter(KeyPublisher):
     @property
     def sent(self) -> tuple[int, int]:
         """How many samples were sent, and the size of their payloads [bytes]."""
-        more = (self.path.samples, self.path.bytes) if self.path else (0, 0)
+        more = (self.publish_path.samples, self.publish_path.bytes) if self.publish_path else (0, 0)
         return self._samples + more[0], self._bytes + more[1]
 
     def write(self, payload: bytes) -> None:

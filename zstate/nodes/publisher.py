@@ -156,7 +156,7 @@ class StatePublisher(SamplePublisher):
         super().__init__(session, robot or model.name, wires, clock, program)
         self.model = model
         self._session = session
-        self._path: PublishPath | None = None
+        self._publish_path: PublishPath | None = None
         out = self._out
         self._encoder = RobotEncoder(model, self.robot, out.session_id)
         for stream in streams:
@@ -191,7 +191,7 @@ class StatePublisher(SamplePublisher):
             if out.streams:
                 out.report_status(lambda: self.stats)
             self._open_cache(cache_s)
-            self._path = self._open_path(joints)
+            self._publish_path = self._open_path(joints)
             out.opened.callback(self._stop_path)
 
     def __repr__(self) -> str:
@@ -215,7 +215,7 @@ class StatePublisher(SamplePublisher):
             None if self._limits is None else self._limits.add_outside,
             type(self._clock) is SystemClock,
         )
-        joints[0].path = path
+        joints[0].publish_path = path
         if out.claim is not None:
             out.claim.on_change = path.pause
         for writer in self._transforms:
@@ -224,7 +224,7 @@ class StatePublisher(SamplePublisher):
         return path
 
     def _at_fork_reinit(self) -> None:
-        self._path = None  # another thread may have been in it, and the session is closed here
+        self._publish_path = None  # another thread may have been in it, and the session is closed here
 
     def _open_cache(self, cache_s: float) -> None:
         """Open the cache, and what is answered from it."""
@@ -276,7 +276,7 @@ class StatePublisher(SamplePublisher):
         a unit quaternion, and a stamp that a wire cannot represent; SecondWriter; and Closed. If it raises,
         nothing was sent.
         """
-        path = self._path
+        path = self._publish_path
         if (
             path is not None
             and self._session.is_usable
@@ -303,13 +303,13 @@ class StatePublisher(SamplePublisher):
 
     def _stop_path(self) -> int:
         """Wait for the end of a call of the path in another thread. Returns the next sequence number."""
-        return self._out.seq if self._path is None else max(self._out.seq, self._path.stop())
+        return self._out.seq if self._publish_path is None else max(self._out.seq, self._publish_path.stop())
 
     def _resume_path(self) -> None:
         """Publish the next samples in one call each, while joint states are all that is sent."""
-        if self._path is None:
+        if self._publish_path is None:
             return
-        self._path.resume(self._out.seq)
+        self._publish_path.resume(self._out.seq)
         # Checked after that: what changes now pauses the path.
         is_alone = False
         try:
@@ -318,11 +318,11 @@ class StatePublisher(SamplePublisher):
             is_alone = is_owner and not any(writer.has_readers for writer in self._transforms)
         finally:
             if not is_alone:
-                self._path.pause()
+                self._publish_path.pause()
 
     @property
     def _sent(self) -> int:
-        return self._out.seq if self._path is None else max(self._out.seq, self._path.seq)
+        return self._out.seq if self._publish_path is None else max(self._out.seq, self._publish_path.seq)
 
     def _encode_derived(
         self, payload: bytes, readable: Sequence[SampleWriter]

@@ -42,8 +42,8 @@ class SamplePublisher(Closeable):
     def stats(self) -> PublisherStats:
         """Counts of published, suppressed and refused samples."""
         streams = {
-            place: StreamStats(*(sent := writer.sent), self._sent - sent[0])
-            for place, writer in self._out.streams.items()
+            key: StreamStats(*(sent := writer.sent), self._sent - sent[0])
+            for key, writer in self._out.streams.items()
         }
         rate = None if self._rate is None else self._rate.report()
         outside, excess = (0, "") if self._limits is None else self._limits.counted()

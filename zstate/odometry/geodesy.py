@@ -45,11 +45,11 @@ class Datum:
     altitude: float = 0.0
 
     def __post_init__(self) -> None:
-        check_place(self.latitude, self.longitude, self.altitude)
+        check_geodetic(self.latitude, self.longitude, self.altitude)
 
     def enu(self, latitude: float, longitude: float, altitude: float) -> Floats:
         """East, north and up from the datum [m], (3,). Raises InvalidInput as the datum itself."""
-        check_place(latitude, longitude, altitude)
+        check_geodetic(latitude, longitude, altitude)
         away = _geocentric(latitude, longitude, altitude) - _geocentric(
             self.latitude, self.longitude, self.altitude
         )
@@ -99,7 +99,7 @@ class Datum:
         )
 
 
-def check_place(latitude: float, longitude: float, altitude: float) -> None:
+def check_geodetic(latitude: float, longitude: float, altitude: float) -> None:
     """Raises InvalidInput for what is no place on the Earth."""
     if abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(altitude) <= _MOST_ALTITUDE:
         return

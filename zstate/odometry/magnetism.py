@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from zstate.errors import InvalidInput, LibraryMissing
-from zstate.odometry.geodesy import check_place
+from zstate.odometry.geodesy import check_geodetic
 
 _STRENGTH_PART, _DIP = 0.1, math.radians(5.0)
 """A field that differs by more from what is expected is not that of the Earth alone."""
@@ -45,7 +45,7 @@ def earth_field(latitude: float, longitude: float, stamp: int) -> EarthField:
     Declinations are within 0.4 degrees at 47 degrees north, and within 0.9 at 80. Raises InvalidInput for
     what is no place, and for stamps before 2010 or after the last model; LibraryMissing without pygeomag.
     """
-    check_place(latitude, longitude, 0.0)
+    check_geodetic(latitude, longitude, 0.0)
     return _modelled(latitude, longitude, round(1970.0 + stamp / _YEAR_NS, 1))
 
 

@@ -28,7 +28,7 @@ from zstate.clock import check_stamp
 from zstate.errors import InPast, InvalidInput, LookupFailed, NoData
 from zstate.odometry.estimator import BaseEstimator, BaseState
 from zstate.odometry.fix_receiver import FixReceiver, FixTrust, PassedFix, PlaneFix, Turn, without_height
-from zstate.odometry.geodesy import SAME_DATUM_M, Datum, check_place
+from zstate.odometry.geodesy import SAME_DATUM_M, Datum, check_geodetic
 from zstate.odometry.health import SourceHealth, gate
 from zstate.odometry.map_alignment import Fixes, MapAlignment, align_in_map, turn
 from zstate.odometry.rotations import skew
@@ -116,7 +116,7 @@ class MapEstimator:
         self._begin_if_odometry_has()
         receiver = self._receiver(source, frame, noise)
         try:
-            check_place(latitude, longitude, altitude or 0.0)
+            check_geodetic(latitude, longitude, altitude or 0.0)
         except InvalidInput as error:
             raise InvalidInput(f"a fix of source {source!r}: {error}") from None
         if latitude == 0.0 and longitude == 0.0:

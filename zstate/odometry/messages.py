@@ -9,7 +9,7 @@ import msgspec
 
 from zstate.errors import InvalidInput
 from zstate.message import StampedMessage
-from zstate.odometry.geodesy import Datum, check_place
+from zstate.odometry.geodesy import Datum, check_geodetic
 from zstate.wire.keys import full_name
 from zstate.wire.messages import (
     WriterTransforms,
@@ -255,7 +255,7 @@ class MapDatum(StampedMessage, frozen=True, array_like=True, gc=False):
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
-        check_place(self.latitude, self.longitude, self.altitude)
+        check_geodetic(self.latitude, self.longitude, self.altitude)
 
     @property
     def datum(self) -> Datum:

@@ -12,7 +12,7 @@ import numpy as np
 from zstate._util.format import did_you_mean
 from zstate.checks import Floats
 from zstate.errors import InvalidInput
-from zstate.odometry.geodesy import check_place
+from zstate.odometry.geodesy import check_geodetic
 from zstate.odometry.health import GATE_PROBABILITY, check_gate
 
 Sigma: TypeAlias = float | tuple[float, float, float]
@@ -183,7 +183,7 @@ class MagnetometerNoise(SourceNoise):
             if not all(map(math.isfinite, numbers)):
                 raise InvalidInput(f"{name} of a magnetometer is finite; got {numbers!r}")
         if self.place is not None:
-            check_place(*self.place, 0.0)
+            check_geodetic(*self.place, 0.0)
 
     def calibrated(self, field: Floats) -> Floats:
         """The field of a measured one [T], (3,)."""

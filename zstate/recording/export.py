@@ -36,7 +36,7 @@ from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput, LibraryMissing, LookupFailed, RecordingError
 from zstate.model.joint_history import JointHistory
-from zstate.recording.joint_states import DELAYED_NS, JointStatePart
+from zstate.recording.joint_states import DELAYED_NS, JointStateBatch
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.keys import frame_owner
 from zstate.wire.messages import Sample
@@ -152,14 +152,14 @@ class Exporter:
         reloaded = ReloadedBuffer(self._recording, self._poses, survey.stamps)
         return self._write_lookups(table, survey, reloaded)
 
-    def _samples(self) -> Iterator[JointStatePart]:
+    def _samples(self) -> Iterator[JointStateBatch]:
         """All samples, in order of their stamps. Raises InvalidInput if there are none."""
         self._refusals.counts.clear()
         reader = self._recording.joint_state_reader(self.robot, self._refusals.count)
         read = 0
-        for part in reader.parts():
-            read += len(part.trajectory)
-            yield part
+        for batch in reader.batches():
+            read += len(batch.trajectory)
+            yield batch
             self._on_progress(read, reader.count)
         if not read:
             reasons = ", ".join(f"{reason} {count}" for reason, count in self._refusals.counts.items())

@@ -25,7 +25,7 @@ from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedRecording, RecordedWriter
-from zstate.recording.joint_states import DELAYED_NS, JointStatePart
+from zstate.recording.joint_states import DELAYED_NS, JointStateBatch
 from zstate.streams import JOINT_STREAMS
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
@@ -218,8 +218,8 @@ class MergedJointStateReader:
         """All rows."""
         return self._read_buffer().joint_states(self.robot)
 
-    def parts(self) -> Iterator[JointStatePart]:
+    def batches(self) -> Iterator[JointStateBatch]:
         """All rows in order of their stamps."""
         trajectory = self.all()
         for first in range(0, len(trajectory), _ROWS):
-            yield JointStatePart(trajectory.select(slice(first, first + _ROWS)), restarts=False)
+            yield JointStateBatch(trajectory.select(slice(first, first + _ROWS)), restarts=False)

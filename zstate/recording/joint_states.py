@@ -1,4 +1,4 @@
-"""Joint states of a recording as arrays, in parts, by the rules of a buffer.
+"""Joint states of a recording as arrays, in batches, by the rules of a buffer.
 
 ``Recording.buffer`` inserts samples one by one. Here the records of a channel that differ only in numbers are
 decoded together, in a fraction of the time; the samples kept are the same, and efforts are kept too.
@@ -39,8 +39,8 @@ _ROWS = 4096
 Refuse = Callable[[str, str], None]
 
 
-class JointStatePart(NamedTuple):
-    """Consecutive samples. With ``restarts`` they begin a new history, and earlier parts do not count."""
+class JointStateBatch(NamedTuple):
+    """Consecutive samples. With ``restarts`` they begin a new history, and earlier batches do not count."""
 
     trajectory: JointHistory
     restarts: bool
@@ -124,15 +124,15 @@ class RecordedJointReader:
     def all(self) -> JointHistory:
         """All samples."""
         whole: _GrowingTrajectory | None = None
-        for trajectory, restarts in self.parts():
+        for trajectory, restarts in self.batches():
             if whole is None or restarts:
                 whole = _GrowingTrajectory(trajectory)
             else:
                 whole.append(trajectory)
         return self._layout.empty() if whole is None else whole.trajectory()
 
-    def parts(self) -> Iterator[JointStatePart]:
-        """All samples in order of their stamps, which ascend across parts too.
+    def batches(self) -> Iterator[JointStateBatch]:
+        """All samples in order of their stamps, which ascend across batches too.
 
         A sample is passed on once another is 10 s newer. Of two samples with one stamp the later one counts.
         """
@@ -143,12 +143,12 @@ class RecordedJointReader:
             restarts |= is_new
             settled = np.count_nonzero(pending.stamps < pending.stamps[-1] - DELAYED_NS)
             if settled:
-                yield JointStatePart(pending.select(slice(settled)), restarts)
+                yield JointStateBatch(pending.select(slice(settled)), restarts)
                 pending, restarts = pending.select(slice(settled, None)), False
         if pending is not None:
-            yield JointStatePart(pending, restarts)
+            yield JointStateBatch(pending, restarts)
 
-    def _as_recorded(self) -> Iterator[JointStatePart]:
+    def _as_recorded(self) -> Iterator[JointStateBatch]:
         """The samples that a buffer keeps, as they were recorded: stamps may go back."""
         is_new = False
         for batch in self._batches():
@@ -159,7 +159,7 @@ class RecordedJointReader:
             kept, restarts = self._epoch.keep(batch.session, trajectory.stamps, batch.seqs[usable])
             is_new |= restarts
             if len(kept):
-                yield JointStatePart(trajectory.select(kept), is_new)
+                yield JointStateBatch(trajectory.select(kept), is_new)
                 is_new = False
 
     def _replace_model(self, description: RobotDescription) -> bool:

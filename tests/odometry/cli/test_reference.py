@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zstate.errors import InvalidInput
-from zstate.odometry.cli.reference import Path, ReferenceName, compared, parse_reference
+from zstate.odometry.cli.reference import PlanarTrajectory, ReferenceName, compared, parse_reference
 
 COUNT = 400
 STAMPS = np.arange(COUNT, dtype=np.int64) * 100_000_000
@@ -21,9 +21,9 @@ def moved(points: np.ndarray, x: float, y: float, yaw: float) -> np.ndarray:
     return points @ np.array(((cosine, sine), (-sine, cosine))) + (x, y)
 
 
-def path(positions: np.ndarray, sigma: float | None) -> Path:
+def path(positions: np.ndarray, sigma: float | None) -> PlanarTrajectory:
     covariances = None if sigma is None else np.tile(sigma**2 * np.eye(2), (len(positions), 1, 1))
-    return Path(STAMPS[: len(positions)], positions, covariances)
+    return PlanarTrajectory(STAMPS[: len(positions)], positions, covariances)
 
 
 def test_shift_and_turn_of_the_frame_are_no_error():
@@ -66,17 +66,17 @@ def test_covariances_of_the_odometry_are_turned_into_the_frame_of_the_reference(
     claimed = np.tile(np.diag((1.0, 1e-6)), (COUNT, 1, 1))
     # Wrong along the way only, so that no motion of the frame takes it.
     bent = straight * np.where(straight[:, :1] > 5.0, 1.1, 1.0)
-    odometry = Path(STAMPS, straight, claimed)
+    odometry = PlanarTrajectory(STAMPS, straight, claimed)
     found = compared("pose/gps", odometry, path(moved(bent, 0.0, 0.0, math.pi / 2), 0.01))
     assert found.end_sigmas is not None
     assert found.end_sigmas < 1.5
 
 
 def test_readings_are_compared_while_there_is_odometry():
-    later = Path(STAMPS[:100], CIRCLE[:100], None)
+    later = PlanarTrajectory(STAMPS[:100], CIRCLE[:100], None)
     assert compared("pose/gps", later, path(CIRCLE, None)).count == 100
     with pytest.raises(InvalidInput, match="pose/gps has 2 readings while there is odometry; 3 or more"):
-        compared("pose/gps", Path(STAMPS[:2], CIRCLE[:2], None), path(CIRCLE, None))
+        compared("pose/gps", PlanarTrajectory(STAMPS[:2], CIRCLE[:2], None), path(CIRCLE, None))
 
 
 def test_robot_that_stood_still_has_an_error_as_well():

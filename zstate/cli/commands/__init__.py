@@ -49,7 +49,7 @@ def own_commands() -> dict[str, Command]:
 
 def load_command(name: str) -> click.Command:
     """``zstate NAME``, a command of zstate."""
-    command = loaded(own_commands()[name].place)
+    command = loaded(own_commands()[name].reference)
     assert isinstance(command, click.Command)
     return command
 
@@ -58,13 +58,13 @@ def load_other_command(name: str) -> click.Command | None:
     """The command ``name`` that another package brings; None if none does. Fails if it cannot be loaded."""
     for one in found_plugins():
         if name in one.plugin.commands:
-            place = one.plugin.command(name).place
+            reference = one.plugin.command(name).reference
             try:
-                command = loaded(place)
+                command = loaded(reference)
             except Exception as error:  # whatever another package's module does when it is imported
                 problem = f"cannot be loaded: {type(error).__name__}: {error}"
-                fail(f"the command {name!r} of {one.distribution} ({place}) {problem}")
+                fail(f"the command {name!r} of {one.distribution} ({reference}) {problem}")
             if not isinstance(command, click.Command):
-                fail(f"the command {name!r} of {one.distribution} ({place}) is no click.Command")
+                fail(f"the command {name!r} of {one.distribution} ({reference}) is no click.Command")
             return command
     return None

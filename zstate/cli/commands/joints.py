@@ -73,14 +73,14 @@ def joints_command(
         if only:
             publisher = PartialStatePublisher(session, model, only, robot_name, (wire,), clock=time)
             shown = f"on {', '.join(only)}"
-            place = messages_for(wire).place(robot_name, (get_wire(wire).partial_joint_states,))
+            place = messages_for(wire).topics(robot_name, (get_wire(wire).partial_joint_states,))
             place += f"/{publisher.writer}" if wire == "native" else ""
         else:
             publisher = StatePublisher(
                 session, model, robot_name, (wire,), streams=("joint_states",), clock=time, takeover=takeover
             )
             shown = f"on {count_text(len(model.joint_names), 'joint')}"
-            place = messages_for(wire).place(robot_name, ("joint_states",))
+            place = messages_for(wire).topics(robot_name, ("joint_states",))
         with publisher, serve_metrics(metrics, publisher_rows(publisher)):
             print_wrapped(f"{robot_name}: a sine {shown}, {rate:g} Hz, on {place}")
             run_publisher(publisher, SineSource(publisher.model), rate, seconds)

@@ -381,7 +381,7 @@ class RobotMonitor(Closeable):
             )
             self._listeners[follow] = self._opened.enter_context(listener), buffer
         self._robots[robot] = MonitoredRobot(robot, follow, *self._listeners[follow])
-        place = self._directory.messages.place(robot, shown)
+        place = self._directory.messages.topics(robot, shown)
         print_status(f"following {place}", event="following", robot=robot)
 
     def report(self, *, as_json: bool) -> None:

@@ -122,8 +122,8 @@ def publish_command(
         StatePublisher(session, model, robot_name, whole_wires, clock=time, takeover=takeover) as whole,
         serve_metrics(metrics, publisher_rows(derived, whole)),
     ):
-        places = [messages_for(wire).place(robot_name, _DERIVED) for wire in derived_wires]
-        places += [messages_for(wire).place(robot_name, _EVERYTHING) for wire in whole_wires]
+        places = [messages_for(wire).topics(robot_name, _DERIVED) for wire in derived_wires]
+        places += [messages_for(wire).topics(robot_name, _EVERYTHING) for wire in whole_wires]
         size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
         print_wrapped(f"publishing {robot_name!r} ({size}) on {' and on '.join(places)}")
         if model.findings:
@@ -161,7 +161,7 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
     from zstate.wire.registry import get_wire
 
     messages, robot = messages_for(wire), derived.robot
-    place = messages.place(robot, ("joint_states",))
+    place = messages.topics(robot, ("joint_states",))
     count = first = last = 0
 
     def on_reading(reading: JointReading) -> None:
@@ -170,7 +170,7 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
         if not count:
             first = reading.stamp
             is_merged = reading.oldest_stamp is not None
-            parts = messages.place(robot, (get_wire(wire).partial_joint_states,))
+            parts = messages.topics(robot, (get_wire(wire).partial_joint_states,))
             print_status(f"receiving {parts if is_merged else place}: {len(reading.positions)} positions")
         count, last = count + 1, reading.stamp
         whole.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)

@@ -182,7 +182,7 @@ def pose_text(edge: Transform) -> str:
 def _edge_text(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...]) -> str:
     pose = pose_text(edge)
     places = " and ".join(
-        messages_for(wire).place(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
+        messages_for(wire).topics(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
     )
     if "native" not in wires:
         return f"{pose}, on {places}; after Ctrl-C late joiners do not receive it"

@@ -162,7 +162,7 @@ def _open_publisher(
 def _place_text(publisher: TransformPublisher, wire: str) -> str:
     from zstate.wire.registry import get_wire
 
-    place = messages_for(wire).place(publisher.robot, (get_wire(wire).transforms,))
+    place = messages_for(wire).topics(publisher.robot, (get_wire(wire).transforms,))
     return f"on {place}/{publisher.writer}, until Ctrl-C" if wire == "native" else f"on {place}, until Ctrl-C"
 
 

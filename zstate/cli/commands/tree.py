@@ -204,7 +204,7 @@ def _collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
         )
         frames = listener.buffer.frames()
         for node in sorted(without_samples(frames, 1)):
-            topic = directory.messages.place(robot, ("tf",))
+            topic = directory.messages.topics(robot, ("tf",))
             print_status(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
         return frames
 

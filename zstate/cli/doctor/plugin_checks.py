@@ -108,14 +108,16 @@ def opened_checks(
 ) -> Generator[Sequence[PluginChecks]]:
     """The checks of all plugins, open."""
 
-    def load(place: str) -> PluginChecks:
-        return loaded(place)(session, robots, wire, on_change)
+    def load(reference: str) -> PluginChecks:
+        return loaded(reference)(session, robots, wire, on_change)
 
     with ExitStack() as opened:
         yield [
             *(opened.enter_context(load(one.checks)) for one in built_in_plugins() if one.checks),
             *(
-                opened.enter_context(_Guarded(one.distribution, lambda place=one.plugin.checks: load(place)))
+                opened.enter_context(
+                    _Guarded(one.distribution, lambda reference=one.plugin.checks: load(reference))
+                )
                 for one in found_plugins()
                 if one.plugin.checks
             ),

@@ -53,7 +53,7 @@ class NativeMessages:
     robot: str | None = None
     """The robot of a command that names none; None if it must name one."""
 
-    def place(self, robot: str, streams: Sequence[StreamName]) -> str:
+    def topics(self, robot: str, streams: Sequence[StreamName]) -> str:
         """The keys or topics of ``streams``."""
         names = streams[0] if len(streams) == 1 else f"{{{','.join(streams)}}}"
         return f"zstate/{robot}/{names}"
@@ -167,7 +167,7 @@ class RosMessages:
         """The topic that carries ``stream`` of ``robot``; for "*" with NAMESPACE as the robot."""
         return self._topics.topic("NAMESPACE" if robot == "*" else robot, stream)
 
-    def place(self, robot: str, streams: Sequence[StreamName]) -> str:
+    def topics(self, robot: str, streams: Sequence[StreamName]) -> str:
         topics = ", ".join(self.topic(robot, stream) for stream in streams)
         return f"ROS 2 topic{'s' if len(streams) > 1 else ''} {topics} ({self._where.removeprefix('in ')})"
 

@@ -63,7 +63,7 @@ def parse_reference(text: str) -> ReferenceName:
     return ReferenceName(stream, check_writer(sensor), sigma)
 
 
-class Path(NamedTuple):
+class PlanarTrajectory(NamedTuple):
     """Positions in a plane: stamps [ns] (n,), x y [m] (n, 2), and covariances (n, 2, 2), None if unknown."""
 
     stamps: NDArray[np.int64]
@@ -71,14 +71,14 @@ class Path(NamedTuple):
     covariances: Floats | None
 
 
-def reference_path(name: ReferenceName, messages: Sequence[Pose | Odometry]) -> Path:
+def reference_trajectory(name: ReferenceName, messages: Sequence[Pose | Odometry]) -> PlanarTrajectory:
     """The positions of a reference; without covariances if some are zero or not known, and no sigma is."""
     noise = np.array([_covariance(one) for one in messages])
     if name.sigma is not None:
         noise[:] = np.eye(2) * name.sigma**2
     is_known = bool((np.diagonal(noise, axis1=1, axis2=2) > 0.0).all())
     blocks = [one.pose if isinstance(one, Pose) else one.poses for one in messages]
-    return Path(
+    return PlanarTrajectory(
         np.array([one.stamp for one in messages], dtype=np.int64),
         np.array([from_block(block)[:2] for block in blocks]),
         noise if is_known else None,
@@ -113,7 +113,7 @@ class Comparison:
         return len(self.positions)
 
 
-def compared(name: str, odometry: Path, reference: Path) -> Comparison:
+def compared(name: str, odometry: PlanarTrajectory, reference: PlanarTrajectory) -> Comparison:
     """The comparison at the readings of the reference while there is odometry.
 
     Raises InvalidInput for less than three of them.

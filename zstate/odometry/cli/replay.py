@@ -24,7 +24,13 @@ from zstate.model.urdf import parse_urdf
 from zstate.odometry import BaseEstimator, BaseState, Datum, MapState, SourceHealth
 from zstate.odometry.cli.delay import Delay, Motions
 from zstate.odometry.cli.heard import recorded_names
-from zstate.odometry.cli.reference import Comparison, Path, ReferenceName, compared, reference_path
+from zstate.odometry.cli.reference import (
+    Comparison,
+    PlanarTrajectory,
+    ReferenceName,
+    compared,
+    reference_trajectory,
+)
 from zstate.odometry.cli.settings_file import WHEEL_KINDS, OdometrySettings, others_text, table_name
 from zstate.odometry.estimator import WHEELS
 from zstate.odometry.fusion import STANDSTILL
@@ -222,12 +228,12 @@ def _against(
     if isinstance(first, Pose) and first.child:
         point = mounts.lookup(states[0].odom_from_base.source, first.child).translation
     poses = [one.odom_from_base for one in states]
-    odometry = Path(
+    odometry = PlanarTrajectory(
         np.array([one.stamp for one in states], dtype=np.int64),
         np.array([(pose.matrix[:3, :3] @ point + pose.translation)[:2] for pose in poses]),
         np.array([one.covariance.pose[:2, :2] for one in states]),
     )
-    return compared(str(name), odometry, reference_path(name, messages))
+    return compared(str(name), odometry, reference_trajectory(name, messages))
 
 
 def _add_joints(base: BaseEstimator, joints: JointHistory, row: int) -> None:

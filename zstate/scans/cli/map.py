@@ -68,7 +68,7 @@ def map_command(
         )
     with open_session(network, wires) as session, MapPublisher(session, place, grid, wires, writer=writer):
         width_m, height_m = grid.size
-        places = [messages_for(wire).place(place, ("map",)) for wire in wires]
+        places = [messages_for(wire).topics(place, ("map",)) for wire in wires]
         places = [f"{one}/{writer}" if one.startswith("zstate/") else one for one in places]
         print_wrapped(
             f"{place}: {width} x {height} cells of {grid.resolution:g} m, {width_m:g} x {height_m:g} m, "

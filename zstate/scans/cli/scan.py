@@ -129,7 +129,7 @@ def scan_command(
         )
         opened.enter_context(publisher)
         opened.enter_context(serve_metrics(metrics, publisher_rows(publisher)))
-        places = [messages_for(wire).place(robot, ("scan",)) for wire in wires]
+        places = [messages_for(wire).topics(robot, ("scan",)) for wire in wires]
         places = [f"{one}/{sensor}" if one.startswith("zstate/") else one for one in places]
         print_wrapped(f"{robot}: scans in {frame}, {rate:g} Hz, on {' and on '.join(places)}")
         run_publisher(publisher, source, rate, seconds)
