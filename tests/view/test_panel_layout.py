@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import viser
 from helpers.robots import RRBOT, SECOND
 
 from zstate.buffer.buffer import TransformBuffer
@@ -70,3 +71,17 @@ def test_update_without_changes_sends_nothing(page, buffer, monkeypatch):
         layout.cursor.seek(2 * SECOND)
         layout.update(source.snapshot(layout.stamp))
         assert sent
+
+
+@pytest.mark.parametrize("can_command, first", [(True, "Joints"), (False, "View")])
+def test_page_opens_on_the_joints_if_sliders_are_asked_for(page, buffer, monkeypatch, can_command, first):
+    groups: list[viser.GuiTabGroupHandle] = []
+    add = page.server.gui.add_tab_group
+    monkeypatch.setattr(page.server.gui, "add_tab_group", lambda: groups.append(add()) or groups[-1])
+    with (
+        ViewSource(None, buffer=buffer) as source,
+        PanelLayout(page, source, Scene(page.server), can_command=can_command),
+    ):
+        labels = groups[0]._tab_labels
+        assert labels[0] == first
+        assert sorted(labels) == ["Frames", "Joints", "Time", "View"]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from zstate import StatePublisher, Transform, load_model
 from zstate.model.geometry import read_shapes
+from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.odometry import OdometryPublisher
 from zstate.scans import Grid, MapPublisher
@@ -142,6 +143,44 @@ def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab
         assert 0.03 < surface.mean() < 0.5
         assert full[surface].max(axis=1).min() < 80
         assert full[surface].min(axis=1).max() > 180
+
+
+SLEDGE = """<robot name="sledge"><link name="rail"/>
+<link name="plate"><visual><geometry><box size="0.02 0.3 0.3"/></geometry>
+<material name="pink"><color rgba="1 0 1 1"/></material></visual></link>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="plate"/><origin xyz="0 0 1"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="10" effort="1"/></joint></robot>"""
+
+
+def test_axes_and_mesh_of_a_moving_link_are_of_one_instant(open_tab, show_view, sessions):
+    model = parse_urdf(SLEDGE, "sledge.urdf")
+    with (
+        StatePublisher(sessions[0], model, "sledge") as publisher,
+        repeated(lambda: publisher.publish([0.6 * math.sin(6.0 * time.monotonic())])),
+    ):
+        shown = show_view(sessions[1], "sledge")
+        until(lambda: "sledge" in shown.source.models)
+        view_tab = open_tab(shown.page.url)
+        until_fitted(shown)
+        height, width = shape_of(view_tab)
+        places: list[float] = []
+        apart: list[float] = []
+
+        def measure() -> bool:
+            """The column of the plate, and how far its red axis, which begins there, is from it."""
+            red, green, blue = np.moveaxis(view_tab.pixels()[:height, :width].astype(int), 2, 0)
+            rows, plate = np.nonzero((red > 90) & (blue > 90) & (green < 60))
+            if len(rows) > 100 and plate.min() > 0 and plate.max() < width - 1:  # it is in the picture
+                beside = slice(rows.min(), rows.max())
+                _, axis = np.nonzero(((red > 120) & (green < 60) & (blue < 60))[beside])
+                if len(axis):
+                    places.append(plate.mean())
+                    apart.append(np.abs(axis - plate.mean()).min() / np.ptp(plate))
+            return len(places) >= 6
+
+        until(measure, PATIENCE_S)
+        assert np.ptp(places) > 0.1 * width, "it moves"
+        assert max(apart) < 0.25, "of the width of the plate"
 
 
 def test_several_browsers_share_one_page_until_the_last_disconnects(open_tab, show_view, sessions):

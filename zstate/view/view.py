@@ -260,6 +260,8 @@ class PanelLayout(Closeable):
         self._fault_html = gui.add_html("")
         drivers = gui.add_folder(None)
         tabs = gui.add_tab_group()
+        # A page opens on its first tab.
+        joints = tabs.add_tab("Joints") if sliders or can_command else None
         # The display panel is first: a fixed frame selected there applies to the other panels.
         with tabs.add_tab("View"):
             self._panels: list[Panel] = [
@@ -270,7 +272,7 @@ class PanelLayout(Closeable):
             self._panels.append(FramesPanel(gui, scene))
             with gui.add_folder("Between two frames"):
                 self._panels.append(TransformPanel(gui))
-        with tabs.add_tab("Joints"):
+        with joints or tabs.add_tab("Joints"):
             for publisher in sliders:
                 with gui.add_folder(f"Move {publisher.robot}"):
                     self._panels.append(SlidersPanel(gui, publisher))

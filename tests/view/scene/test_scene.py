@@ -62,11 +62,8 @@ def test_visuals_are_drawn_at_their_links(scene, server):
 
 def test_shape_moves_with_its_link_without_being_sent_again(scene, server):
     with sent_messages(server) as messages:
-        scene.axes = False
         scene.show(snapshot(TREE, POSES | {"cart/base": at(3, 0, 0)}), "map")
-    assert [type(message).__name__ for message in messages if "Visibility" not in type(message).__name__] == [
-        "SetPositionMessage"
-    ]
+    assert [type(message).__name__ for message in messages] == ["SetPositionMessage"]
     assert places(server) == [(3, 0, 1), (3, 2, 0)]
 
 
@@ -192,7 +189,31 @@ def the_axes(server):
     return axes
 
 
-def test_axes_of_all_frames_with_a_pose_are_one_node(scene, server):
+def axes_on_nodes(server) -> list[tuple[float, ...]]:
+    """The places of the nodes with axes."""
+    nodes = handles(server, viser.FrameHandle).items()
+    paths = [path for path, node in nodes if node.show_axes and is_visible(server, path)]
+    return sorted(tuple(np.round(pose_in_fixed(server, path)[:3], 6).tolist()) for path in paths)
+
+
+def test_axes_of_a_robot_are_on_the_nodes_of_its_meshes_while_their_poses_are_known(scene, server):
+    assert axes_on_nodes(server) == [(1, 0, 0), (1, 2, 0)]
+    scene.show(snapshot(TREE, POSES | {"cart/base": at(3, 0, 0)}), "map")
+    assert axes_on_nodes(server) == [(3, 0, 0), (3, 2, 0)]
+    scene.show(snapshot(TREE, POSES, unknown=["cart/wheel"]), "map")
+    assert axes_on_nodes(server) == [(1, 0, 0)]
+    scene.axes = False
+    scene.show(snapshot(TREE, POSES), "map")
+    assert axes_on_nodes(server) == []
+    scene.axes = True
+    scene.show(snapshot(TREE, POSES), "map")
+    assert axes_on_nodes(server) == [(1, 0, 0), (1, 2, 0)]
+
+
+def test_axes_of_other_frames_are_one_node(server):
+    scene = Scene(server)
+    scene.show(snapshot(TREE, POSES), "map")
+    assert axes_on_nodes(server) == []
     assert np.sort(the_axes(server).batched_positions, axis=0).tolist() == [[0, 0, 0], [1, 0, 0], [1, 2, 0]]
     scene.show(snapshot(TREE, POSES, unknown=["cart/wheel"]), "map")
     assert the_axes(server).batched_positions.tolist() == [[0, 0, 0], [1, 0, 0]]
@@ -203,6 +224,10 @@ def test_axes_of_all_frames_with_a_pose_are_one_node(scene, server):
     scene.show(snapshot(TREE, POSES), "map")
     assert the_axes(server).visible
     assert len(the_axes(server).batched_positions) == 3
+    scene.set_robot("cart", CART)
+    drawn(scene, snapshot(TREE, POSES))
+    assert the_axes(server).batched_positions.tolist() == [[0, 0, 0]]
+    assert axes_on_nodes(server) == [(1, 0, 0), (1, 2, 0)]
 
 
 def test_parent_lines_connect_each_frame_to_its_parent(scene, server):

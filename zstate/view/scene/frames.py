@@ -69,6 +69,7 @@ class FrameNodes:
         self._rows: Rows = np.empty(0, dtype=np.intp)
         self._node_handles: list[viser.FrameHandle] = []
         self._carriers: frozenset[str] = frozenset()
+        self._with_axes: Mask = np.empty(0, dtype=np.bool_)
         self._poses: Poses = np.empty((0, 7))
         self.tree: FrameTable | None = None
         self.paths: dict[str, str] = {}
@@ -95,6 +96,16 @@ class FrameNodes:
         poses = np.where((shown & on_shown)[:, None], snapshot.poses, in_fixed)
         self._move(poses[self._rows])
 
+    def show_axes(self, frames: Mask) -> None:
+        """Draw axes at the shown ones of ``frames``, a flag for each row of the tree; all of them have nodes.
+
+        A browser moves what is on a node at once, as meshes, but the instances of a node one picture later.
+        """
+        on = (frames & self.shown)[self._rows]
+        for row in np.flatnonzero(on != self._with_axes).tolist():
+            self._node_handles[row].show_axes = bool(on[row])
+        self._with_axes = on
+
     def is_shown(self, frame: str) -> bool:
         """Whether the pose of the frame in the fixed one is known."""
         return self.tree is not None and frame in self.paths and bool(self.shown[self.tree.row(frame)])
@@ -114,9 +125,16 @@ class FrameNodes:
                 handle.remove()  # with its descendants
         for path in paths.values():
             if path not in self._handles:
-                self._handles[path] = self._scene.add_frame(path, show_axes=False)
+                self._handles[path] = self._scene.add_frame(
+                    path,
+                    show_axes=False,
+                    axes_length=_AXIS_LENGTH_M,
+                    axes_radius=_AXIS_RADIUS_M,
+                    origin_radius=_AXIS_RADIUS_M,
+                )
         self._rows = np.array([tree.row(name) for name in paths], dtype=np.intp)
         self._node_handles = [self._handles[path] for path in paths.values()]
+        self._with_axes = np.array([handle.show_axes for handle in self._node_handles], dtype=np.bool_)
         self._poses = np.full((len(paths), 7), np.nan)
         self.shown = np.zeros(0, dtype=np.bool_)
         self.tree, self.paths = tree, paths
@@ -173,7 +191,7 @@ def set_instances(
 
 
 class Axes:
-    """Three short lines at each frame, red x, green y, blue z; one node of viser for all."""
+    """Three short lines at each frame, red x, green y, blue z, as instances of one node of viser."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene

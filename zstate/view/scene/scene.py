@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
+from zstate.buffer.snapshot import FramePoses, FrameTable, Mask, Poses
 from zstate.model.findings import Finding
 from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
@@ -63,6 +63,8 @@ class Scene:
         self._faults: dict[str, list[tuple[str, str]]] = {}
         self._stale: dict[str, str] = {}
         self._tree: FrameTable | None = None
+        self._node_rows_of: tuple[FrameTable, tuple[str, ...]] | None = None
+        self._node_rows: Mask = np.empty(0, dtype=np.bool_)
         self._first_frames: dict[str, str] = {}
         self._roots: dict[str, str] = {}
         self._nodes = FrameNodes(scene)
@@ -160,20 +162,32 @@ class Scene:
         stale = {frames[robot]: f"{robot}: {text}" for robot, text in self._stale.items() if robot in frames}
         placed = self.layout.placed(snapshot, fixed)
         on_links = (meshes.frames for meshes in self._single.values())
-        carriers = tree.names if self.names else chain(stale, self.layout.labels, *on_links)
+        with_nodes = self._rows_with_nodes(tree) if self.axes else np.zeros(len(tree.names), dtype=np.bool_)
+        with_axes = (tree.names[row] for row in np.flatnonzero(with_nodes).tolist())
+        carriers = tree.names if self.names else chain(stale, self.layout.labels, with_axes, *on_links)
         self._nodes.show(snapshot, placed, frozenset(carriers))
         shown = self._nodes.shown
+        self._nodes.show_axes(with_nodes)
         for name, meshes in self._single.items():
             meshes.show(self._nodes, self._styles(name))
         for group in self._instanced.values():
             group.show(tree, placed, {name: self._styles(name) for name in group.robots})
-        self._axes.show(self.axes, placed, shown)
+        self._axes.show(self.axes, placed, shown & ~with_nodes)
         self._lines.show(self.parent_lines, placed, shown, tree.parents)
         self._names.show(self.names, snapshot, self._nodes)
         self._trails.show(snapshot, fixed, placed)
         self._stale_labels.show(stale, self._nodes)
         self._tree_labels.show(self.layout.labels, self._nodes)
         return placed
+
+    def _rows_with_nodes(self, tree: FrameTable) -> Mask:
+        """The frames of robots whose meshes are on nodes: so are their axes, which move with the meshes."""
+        of = tree, tuple(self._single)
+        if of != self._node_rows_of:
+            self._node_rows_of = of
+            robots = [name.partition("/")[0] for name in tree.names]
+            self._node_rows = np.array([robot in self._single for robot in robots], dtype=np.bool_)
+        return self._node_rows
 
     def corners(self, tree: FrameTable, placed: Poses) -> NDArray[np.float64]:
         """The corners of the bounding boxes of all loaded visuals with a known pose: (N, 3) [m]."""
