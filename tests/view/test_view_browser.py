@@ -173,8 +173,9 @@ def test_axes_and_mesh_of_a_moving_link_are_of_one_instant(open_tab, show_view, 
             if len(rows) > 100 and plate.min() > 0 and plate.max() < width - 1:  # it is in the picture
                 beside = slice(rows.min(), rows.max())
                 _, axis = np.nonzero(((red > 120) & (green < 60) & (blue < 60))[beside])
-                places.append(plate.mean())
-                apart.append(np.abs(axis - plate.mean()).min(initial=width) / np.ptp(plate))
+                if len(axis):
+                    places.append(plate.mean())
+                    apart.append(np.abs(axis - plate.mean()).min() / np.ptp(plate))
             return len(places) >= 6
 
         until(measure, PATIENCE_S)

@@ -52,7 +52,7 @@ class Panels:
         self.view_tab = view_tab
         self.tab = view_tab.tab
         self.tab.set_default_timeout(TIMEOUT_S * 1e3)
-        view_tab.text("Fixed frame")
+        view_tab.text("Frames", exact=True)
 
     def open(self, name: str) -> None:
         """Select a tab of the panels."""
@@ -92,7 +92,6 @@ def panels(open_tab, show_view) -> Callable[..., Panels]:
 def test_slider_moves_the_joint_and_the_displayed_link_pose(panels, sessions):
     with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
         page = panels(sessions[1], "r1", sliders=[sliders])
-        page.open("Joints")
         page.field(SHOULDER).fill("0.5")
         page.field(ELBOW).fill("-0.25")
         until(lambda: sliders.positions.tolist() == [0.5, -0.25])
@@ -122,7 +121,6 @@ def test_slider_panel_names_the_conflicting_writer(panels, sessions):
     ):
         driver.publish([0.0, 0.0])
         page = panels(sessions[1], "r1", sliders=[sliders])
-        page.open("Joints")
         assert "driver@" in page.view_tab.text("r1 is not published").inner_text()
         page.view_tab.save_screenshot("panels_refused")
         driver.close()
@@ -137,7 +135,6 @@ def test_sliders_command_a_driver_only_in_control_and_the_stop_button_ends_that(
     host = host_driver()
     page = panels(sessions[1], "arm", can_command=True)
     page.view_tab.text("Driver of arm: ready")
-    page.open("Joints")
     page.view_tab.text("The sliders follow the joints")
     page.field(ELBOW).fill("0.5")
     until(lambda: page.field(ELBOW).input_value() == "0")
