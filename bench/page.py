@@ -39,9 +39,9 @@ PARTS = {
     "chain": "1000 Hz",
     "publisher": "g1",
     "kinematics": "talos",
-    "lookup": "by name|plan|batch|memory|future",
-    "startup": "ls|tree|--version",
-    "view": "CPU",
+    "lookup": "^arm, by name:|^arm, plan|batch|1 kHz|memory|future",
+    "startup": "zstate",
+    "view": "CPU|picture",
 }
 """The micro benchmarks of the page, and which of their rows it shows."""
 
@@ -89,7 +89,7 @@ def why_stale(results: Results) -> str | None:
         return None
     return (
         f"the figures of {results.folder.name} are {days} days and {count} commits older than the last "
-        f"change of what they measure; {MOST_DAYS} and {MOST_COMMITS} are allowed, and `{COMMAND}` renews them"
+        f"change of what they measure; {MOST_DAYS} and {MOST_COMMITS} are allowed. `{COMMAND}` renews them"
     )
 
 
