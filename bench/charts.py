@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Drawing
 
 from bench.report import number, origin
 from bench.results import BYTES, CPU, MEMORY, P50, P99, Figure, Results, Spread
-from bench.scenario import Scenario
+from bench.scenario import PAGE, Scenario
 
 INK, FAINT = "#222222", "#767676"
 # Okabe and Ito's colours, which are distinguishable with colour blindness: zstate, other systems, floors.
@@ -41,8 +41,9 @@ STYLE = {
 
 
 def write_charts(results: Results) -> list[Path]:
-    """Writes a chart of each scenario with one reader and several rounds into the results folder."""
-    chosen = [one for one in results.scenarios if one.rounds > 1 and results.measured(one) and not one.soaks]
+    """Writes a chart of each scenario of the page into the results folder."""
+    names = {one.name for one in PAGE}
+    chosen = [one for one in results.scenarios if one.name in names and results.measured(one)]
     return [write_chart(results, scenario) for scenario in chosen]
 
 

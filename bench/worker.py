@@ -94,14 +94,15 @@ class SampleLog:
                 self.complete.set()
 
     def save(self, folder: str, label: str) -> None:
-        """Writes the arrays to files."""
+        """Writes the arrays to files, all with the same answers: a system that lags still answers now."""
+        count = len(self.robots) or len(self.stamps)
         for name in ("stamps", "times", "robots"):
             with (Path(folder) / f"{label}.{name}").open("wb") as file:
-                getattr(self, name).tofile(file)
+                getattr(self, name)[:count].tofile(file)
 
     def choose(self, begin: int, end: int) -> list[tuple[int, int]]:
         """Up to ``CHECKS`` pairs of stamp and robot between ``begin`` and ``end``, spread evenly."""
-        within = [n for n, stamp in enumerate(self.stamps) if begin <= stamp <= end]
+        within = [n for n in range(len(self.robots)) if begin <= self.stamps[n] <= end]
         chosen = within[:: max(1, len(within) // CHECKS)][:CHECKS]
         return [(self.stamps[n], self.robots[n]) for n in chosen]
 

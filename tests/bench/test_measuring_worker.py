@@ -261,6 +261,18 @@ def test_samples_have_the_stamps_of_their_sending(job: Job) -> None:
     assert before <= stamps[0] <= time.time_ns()
 
 
+def test_reader_that_still_answers_saves_whole_answers_only(job: Job) -> None:
+    record = SampleLog(job)
+    record.on_answer(1)
+    record.on_answer(2)
+    record.times.append(time.time_ns())  # the answering thread is between the appends of its next answer
+    record.stamps.append(3)
+    record.save(job.folder, "reader0")
+    assert numbers(job, "reader0.stamps") == [1, 2]
+    assert len(numbers(job, "reader0.times")) == len(numbers(job, "reader0.robots")) == 2
+    assert record.choose(0, 9) == [(1, 0), (2, 0)]
+
+
 def test_soak_counts_samples_and_latched_values_of_every_robot(
     job: Job, start_role: Callable[..., RunningRole]
 ) -> None:
