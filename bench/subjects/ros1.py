@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import xmlrpc.client
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -150,6 +149,8 @@ SUBJECTS = (
 
 
 def _master() -> Any:
+    import xmlrpc.client  # noqa: PLC0415 - 5 MB, and each worker imports this module
+
     return xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"])
 
 
