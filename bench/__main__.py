@@ -1,4 +1,4 @@
-"""The benchmark: ``python -m bench setup``, then ``run``, then ``report``."""
+"""The benchmark: ``python -m bench`` compares what is installed; ``page`` renews the documentation."""
 
 from __future__ import annotations
 
@@ -6,174 +6,199 @@ import secrets
 import shlex
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from bench import results
-from bench.page import PAGE, with_current_tables
-from bench.plots import PlotsMissing, write_plots
-from bench.process import ROOT
-from bench.report import write_report
-from bench.run import Turn, estimated_seconds, plan_turns, run
-from bench.scenario import FULL, QUICK, select_scenarios
-from bench.subjects import NAMES, subject_named
+from bench.page import COMMAND, PARTS, documents, shown_folders
+from bench.report import cell, soak_lines, write_report
+from bench.results import FIGURES, ROOT, Results
+from bench.scenario import PAGE, QUICK, Scenario, estimated_seconds, plan_turns, select_scenarios
+from bench.subjects import all_subjects
 from bench.subjects.subject import Subject
-from bench.trial import Facts
+from bench.trial import Facts, run_trial
 
 CONSOLE = Console()
+SUBJECTS = all_subjects()
+QUICK_WITHIN_S = 110.0
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-def main() -> None:
-    """Compare zstate with the real systems: rates, latency and cost."""
+@click.group(invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
+@click.pass_context
+def main(context: click.Context) -> None:
+    """Compare zstate with the real systems. Alone: a table of what is installed, in two minutes."""
+    if context.invoked_subcommand is None:
+        quick()
+
+
+def quick() -> None:
+    """Runs every installed subject once, and prints a table."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = measure(Path(folder), list(SUBJECTS.values()), QUICK, within_s=QUICK_WITHIN_S)
+        [scenario] = found.scenarios
+        table = Table(scenario.title, *(one.title for one in FIGURES[:-1]), box=None)
+        for name in found.measured(scenario):
+            cells = (cell(found.spread(name, scenario, one)) for one in FIGURES[:-1])
+            table.add_row(found.title(name), *cells)
+        CONSOLE.print(table)
+        for run in found.failures:
+            _say(f"{run['subject']} failed: {run['failed']}")
+    for one in SUBJECTS.values():
+        if one.python() is None:
+            root = " (as root)" if any("apt-get" in command for command in one.install) else ""
+            _say(f"{one.name} is not installed: python -m bench setup {one.name}{root}")
+    _say(f"One short run each on a machine that may be busy: no figures to quote. `{COMMAND}` makes those.")
 
 
 @main.command()
-@click.argument("names", nargs=-1, metavar="[SUBJECT]...")
-def setup(names: tuple[str, ...]) -> None:
-    """Show which subjects are installed; install each named SUBJECT with the commands shown."""
+@click.argument("names", nargs=-1, metavar="[SUBJECT]...", type=click.Choice(list(SUBJECTS)))
+def setup(names: Sequence[str]) -> None:
+    """Install each SUBJECT; without any, list the commands that do."""
     for name in names:
-        for command in _subject(name).install:
-            CONSOLE.print(f"[bold]$ {command}[/]", highlight=False)
+        for command in SUBJECTS[name].install:
+            _say(f"$ {command}")
             # The command shown is the command run; it comes from this repository.
             if subprocess.run(command, shell=True, cwd=ROOT, check=False).returncode:
                 raise click.ClickException(f"{name}: this command failed; the commands after it were not run")
-    _show_installed([subject_named(name) for name in NAMES])
-
-
-def _show_installed(subjects: Sequence[Subject]) -> None:
-    table = Table("subject", "is", "installed", box=None)
-    missing = [one for one in subjects if one.python() is None]
-    for one in subjects:
-        versions = "[red]no[/]" if one in missing else ", ".join(map(" ".join, one.versions().items()))
-        table.add_row(one.name, one.title, versions)
-    CONSOLE.print(table)
-    for one in missing:
-        CONSOLE.print(f"\n[bold]{one.name}[/]: python -m bench setup {one.name}, which is", highlight=False)
-        for command in one.install:
-            # Unbroken, so that it can be pasted.
-            CONSOLE.print(f"  {command}", highlight=False, markup=False, soft_wrap=True)
+    for one in SUBJECTS.values() if not names else ():
+        versions = (
+            "not installed" if one.python() is None else ", ".join(map(" ".join, one.versions().items()))
+        )
+        _say(f"{one.name}: {one.title}; {versions}")
+        for command in one.install if one.python() is None else ():
+            _say(f"  {command}")
 
 
 @main.command("run")
 @click.option(
-    "--quick", is_flag=True, help="A few scenarios with short windows: minutes instead of most of an hour."
+    "--subject", "names", multiple=True, type=click.Choice(list(SUBJECTS)), help="Only this one; repeatable."
 )
 @click.option(
-    "--subject", "subjects", multiple=True, metavar="NAME", help="Run only this subject; may be repeated."
+    "--scenario", "patterns", multiple=True, metavar="PATTERN", help="As talos-1000 or panda-*; repeatable."
 )
+@click.option("--rounds", type=click.IntRange(min=1), help="Rounds of each scenario.")
+@click.option("--seconds", type=float, help="The measured window.")
 @click.option(
-    "--scenario",
-    "words",
-    multiple=True,
-    metavar="NAME",
-    help="Run only this scenario or group; may be repeated.",
-)
-@click.option(
-    "--repeat",
-    default=1,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="Multiply the number of rounds.",
+    "--to", "parent", type=click.Path(path_type=Path), default=results.FOLDER, help="Where results go."
 )
 @click.option("--seed", type=int, help="Seed of the order of subjects; random by default.")
 @click.option("--list", "only_list", is_flag=True, help="List the runs and their total duration, then exit.")
 def run_command(
     *,
-    quick: bool,
-    subjects: tuple[str, ...],
-    words: tuple[str, ...],
-    repeat: int,
+    names: Sequence[str],
+    patterns: Sequence[str],
+    rounds: int | None,
+    seconds: float | None,
+    parent: Path,
     seed: int | None,
     only_list: bool,
 ) -> None:
-    """Measure, and write the report."""
+    """Measure scenarios, and write a report. PAGE's two have several rounds, the others one."""
     try:
-        scenarios = select_scenarios(QUICK if quick else FULL, words)
+        scenarios = select_scenarios(patterns, rounds=rounds, seconds=seconds)
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
-    chosen = [_subject(name) for name in subjects or NAMES]
-    seed = secrets.randbits(32) if seed is None else seed
-    planned = plan_turns([one for one in chosen if one.python() is not None], scenarios, repeat, seed)
-    CONSOLE.print(
-        f"{len(planned)} runs, about {estimated_seconds(planned) / 60:.0f} minutes, seed {seed}",
-        highlight=False,
-    )
-    for one in chosen:
-        if one.python() is None:
-            CONSOLE.print(f"not installed: {one.title}; python -m bench setup {one.name}", highlight=False)
+    subjects = [SUBJECTS[name] for name in names or SUBJECTS]
     if only_list:
-        for turn in planned:
-            CONSOLE.print(f"{turn.scenario.name}  {turn.subject.name}", highlight=False)
+        for turn in plan_turns([one for one in subjects if one.python()], scenarios, seed or 0):
+            _say(f"{turn.scenario.name}  {turn.subject.name}")
         return
-    folder = results.new_folder()
-    results.write_about(folder, shlex.join(["python", "-m", "bench", *sys.argv[1:]]), chosen, scenarios, seed)
-    _run(folder, planned)
-    _report(folder)
+    folder = results.new_folder(parent)
+    report(measure(folder, subjects, scenarios, seed=seed))
 
 
-def _run(folder: Path, planned: list[Turn]) -> None:
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    # Drawn only between runs: a moving bar would be measured too.
-    with Progress(*columns, console=CONSOLE, auto_refresh=False) as progress:
-        task = progress.add_task("", total=len(planned))
+@main.command()
+@click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--rounds", type=click.IntRange(min=1), help="Fewer rounds, for a trial.")
+@click.option("--seconds", type=float, help="A shorter window, for a trial.")
+@click.option(
+    "--to", "root", type=click.Path(exists=True, path_type=Path), default=ROOT, help="Another checkout."
+)
+def page(*, folder: Path | None, rounds: int | None, seconds: float | None, root: Path) -> None:
+    """Measure the figures of docs/benchmarks.md and README.md, and write them; with FOLDER only write."""
+    if folder is None:
+        if root == ROOT and results.commit().endswith("-dirty"):
+            raise click.ClickException(
+                "figures need a commit to name: commit the changes of zstate and bench first"
+            )
+        folder = results.new_folder(root / "bench" / "results")
+        scenarios = select_scenarios([one.name for one in PAGE], rounds=rounds, seconds=seconds)
+        measure(folder, list(SUBJECTS.values()), scenarios)
+        measure_parts(folder)
+    before = shown_folders(root)
+    report(Results.read(folder))
+    for path, text in documents(Results.read(folder), root).items():
+        path.write_text(text, encoding="utf-8")
+        _say(str(path))
+    for old in sorted(before - shown_folders(root)):
+        _say(f"no page shows this one any more: git rm -r {old.relative_to(root)}")
 
-        def show(number: int, turn: Turn, facts: Facts | None) -> None:
-            what = f"{turn.scenario.name}  {turn.subject.title}"
-            if facts is None:
-                progress.update(task, description=what, completed=number, refresh=True)
-            else:
-                progress.update(task, completed=number + 1)
-                progress.print(f"{what}: {_summary(facts)}", highlight=False, markup=False, soft_wrap=True)
 
-        run(folder, planned, show)
-        progress.update(task, description="done", refresh=True)
+def measure_parts(folder: Path) -> None:
+    """Runs the micro benchmarks of the page; one that fails is left out and named."""
+    for name in PARTS:
+        command = [sys.executable, "-m", "bench.micro", name, "--json", str(folder / results.MICRO)]
+        if subprocess.run(command, cwd=ROOT, check=False).returncode:
+            _say(f"`python -m bench.micro {name}` failed: its rows are missing")
+
+
+def measure(
+    folder: Path,
+    subjects: Sequence[Subject],
+    scenarios: Sequence[Scenario],
+    *,
+    seed: int | None = None,
+    within_s: float | None = None,
+) -> Results:
+    """Runs every installed subject in every scenario into ``folder``; no turn begins after ``within_s``."""
+    seed = secrets.randbits(32) if seed is None else seed
+    turns = plan_turns([one for one in subjects if one.python() is not None], scenarios, seed)
+    _say(f"{len(turns)} runs, about {estimated_seconds(turns) / 60:.0f} minutes, seed {seed}")
+    results.write_about(
+        folder, shlex.join(["python", "-m", "bench", *sys.argv[1:]]), subjects, scenarios, seed
+    )
+    began = time.monotonic()
+    for number, turn in enumerate(turns, 1):
+        if within_s is not None and time.monotonic() > began + within_s:
+            left = ", ".join(one.subject.name for one in turns[number - 1 :])
+            _say(f"not run, as this machine is slow or busy: {left}")
+            break
+        facts = run_trial(turn.subject, turn.scenario)
+        head = {"subject": turn.subject.name, "scenario": turn.scenario.name, "round": turn.round}
+        results.append(folder, {**head, **facts})
+        _say(f"{number} of {len(turns)}  {turn.scenario.name}  {turn.subject.title}: {_summary(facts)}")
+    return Results.read(folder)
 
 
 def _summary(facts: Facts) -> str:
     if "failed" in facts:
         return f"FAILED, {facts['failed']}"
-    if "whole_ms" in facts:
-        return f"whole tree within {max(facts['whole_ms']):g} ms"
-    rates = [one["rate_hz"] for one in facts["readers"]]
+    if "soak" in facts:
+        return "\n".join(soak_lines(facts["soak"]))
+    slowest = min(one["rate_hz"] for one in facts["readers"])
     cpu = ", ".join(f"{role} {percent:g} %" for role, percent in facts["cpu_percent"].items())
-    medians = [one["latency_us"][50] for one in facts["readers"] if one["latency_us"]]
-    return f"{min(rates):.1f} Hz, {max(medians, default=float('nan')):.0f} us, {cpu}"
+    return f"{slowest:.1f} Hz, {cpu}"
 
 
-@main.command()
-@click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option(
-    "--page", is_flag=True, help="Rewrite the tables of docs/benchmarks.md, each from the folder it names."
-)
-def report(*, folder: Path | None, page: bool) -> None:
-    """Rewrite the tables and plots of the last run, or of the run in FOLDER."""
-    if page:
-        PAGE.write_text(with_current_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-    else:
-        _report(folder or results.newest())
-
-
-def _report(folder: Path) -> None:
-    found = results.Results.read(folder)
-    plots: list[Path] = []
+def report(found: Results) -> None:
+    """Writes the charts and the report."""
     try:
-        plots = write_plots(found)
-    except PlotsMissing as reason:
-        CONSOLE.print(str(reason), highlight=False, markup=False)
-    for path in (write_report(found, plots), *plots):
-        CONSOLE.print(str(path), highlight=False, soft_wrap=True)
+        from bench.charts import write_charts  # noqa: PLC0415 - tables need no matplotlib
+
+        write_charts(found)
+    except ImportError as error:
+        _say(f"no charts, as they need matplotlib ({error}): pip install -e '.[bench]'")
+    _say(str(write_report(found)))
 
 
-def _subject(name: str) -> Subject:
-    if name not in NAMES:
-        raise click.BadParameter(f"{name!r} is not one of {', '.join(NAMES)}", param_hint="subject")
-    return subject_named(name)
+def _say(text: str) -> None:
+    CONSOLE.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -12,15 +11,14 @@ class Job:
     """One run of one subject, as sent to each of its processes.
 
     ``rows`` are joint positions [rad] or [m] in the order of ``joints``: a smooth motion that the writer
-    repeats. ``base`` and ``tip`` are the target and source of the readers' lookups, ``links`` all links of
-    the robot. ``rate_hz`` is 0 for as fast as possible.
+    repeats, with its transforms in the ``MotionFile`` at ``motion``. ``base`` and ``tip`` are the target and
+    source of the readers' lookups, ``links`` all links of the robot.
 
     ``robots`` are all robots on the network, by name; a writer process publishes the robots in ``mine``, with
     one ``Writer`` each, which share one link if ``one_link``. Readers follow the first ``follows`` robots, or
     all if it is 0. ``routers`` is the number of routers in a row between writers and readers.
 
-    ``load`` is "none", "busy" (a thread of the reader holds the GIL) or "slow" (the reader sleeps 10 ms after
-    each answer).
+    If it ``soaks``, processes count samples in constant memory, and writers also publish a latched value.
 
     ``ports`` are free loopback ports reserved for this run; ``folder`` is an empty temporary folder.
     """
@@ -33,16 +31,15 @@ class Job:
     links: tuple[str, ...]
     rows: tuple[tuple[float, ...], ...]
     rate_hz: float
+    motion: str = ""
     robots: tuple[str, ...] = ("robot",)
     mine: tuple[str, ...] = ("robot",)
-    readers: int = 1
     follows: int = 0
     routers: int = 1
     one_link: bool = False
-    load: str = "none"
+    soaks: bool = False
     ports: tuple[int, ...] = ()
     folder: str = ""
-    extra: dict[str, Any] = field(default_factory=dict)
 
     @property
     def robot(self) -> str:

@@ -8,17 +8,19 @@ import queue
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from bench.measure import process_tree
 
 ROOT = Path(__file__).parents[1]
+START_WITHIN_S = 60.0
 END_WITHIN_S = 4.0
 
 
@@ -91,11 +93,12 @@ class Process:
             raise self.failed(f"failed: {message.get('error', line)}")
         return message
 
-    def wait_for_text(self, text: str, within_s: float) -> None:
-        """Waits for a service's line that contains ``text``. Raises RunFailed if none arrives in time."""
+    def wait_for_text(self, text: str, within_s: float) -> str:
+        """A service's next line that contains ``text``. Raises RunFailed if none arrives in time."""
         deadline = time.monotonic() + within_s
-        while text not in self._line(deadline - time.monotonic(), repr(text)):
+        while text not in (line := self._line(deadline - time.monotonic(), repr(text))):
             pass
+        return line
 
     def _line(self, within_s: float, what: str) -> str:
         try:
@@ -131,6 +134,26 @@ class Process:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(within_s)
         return self._process.poll() is not None
+
+
+@contextmanager
+def running(role: str, *command: str, **variables: str) -> Iterator[Process]:
+    """A worker inside the block, with ``variables`` in its environment."""
+    process = Process(role, command, variables)
+    try:
+        yield process
+    finally:
+        process.stop()
+
+
+@contextmanager
+def running_command(*arguments: str, text: str = "") -> Iterator[tuple[int, str]]:
+    """Runs ``zstate ARGUMENTS`` inside the block; yields its process id and its first line with ``text``."""
+    process = Process(arguments[0], (sys.executable, "-m", "zstate", *arguments), {}, is_service=True)
+    try:
+        yield process.pid, process.wait_for_text(text, START_WITHIN_S)
+    finally:
+        process.stop()
 
 
 def _handles(pids: Sequence[int]) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,9 +82,7 @@ def _numbers(folder: str, label: str, name: str) -> Numbers:
     return np.fromfile(Path(folder) / f"{label}.{name}", dtype=np.int64)
 
 
-def reader_figures(
-    sent: Recording, answered: Recording, window: Window, rate_hz: float
-) -> dict[str, float | int | list[float] | None]:
+def reader_figures(sent: Recording, answered: Recording, window: Window, rate_hz: float) -> dict[str, Any]:
     """Figures of one reader.
 
     ``rate_hz`` counts answers made within the window. The other figures count samples stamped in the window:
@@ -91,12 +90,11 @@ def reader_figures(
     """
     asked = sent.keys(window.begin)[window.holds(sent.stamps)]
     latencies = (answered.times - answered.stamps)[window.holds(answered.stamps)] * 1e-3
-    period_us = 1e6 / rate_hz if rate_hz else None
     return {
         "rate_hz": round(rate_in(answered.times, window), 3),
         "answered": len(latencies),
         "lost": int((~np.isin(asked, answered.keys(window.begin))).sum()),
-        "late": None if period_us is None else int((latencies > period_us).sum()),
+        "late": int((latencies > 1e6 / rate_hz).sum()),
         "latency_us": latency_grid(latencies),
     }
 
@@ -127,3 +125,45 @@ def latency_grid(latencies_us: NDArray[np.float64]) -> list[float]:
 def percentile(grid: Sequence[float], percent: float) -> float:
     """One percentile of ``GRID``."""
     return grid[GRID.index(percent)]
+
+
+Answer = tuple[int, int, "list[float] | str | None"]
+"""Stamp, robot index, and the pose7 of the tip or an error text; None if the system computes no poses."""
+
+
+def pose_errors(
+    sent: Recording, expected: NDArray[np.float64], answers: Sequence[Answer], begin: int
+) -> dict[str, Any]:
+    """Differences between answers and ``expected`` (N, 7), the poses of the repeated rows."""
+    keys, distances, angles, errors = sent.keys(begin), [0.0], [0.0], []
+    for stamp, robot, pose in answers:
+        asked = Recording(np.array([stamp]), np.array([robot])).keys(begin)
+        places = np.flatnonzero(keys == asked)
+        if not places.size:
+            errors.append(f"an answer at {stamp}, where no sample was sent")
+        elif isinstance(pose, str):
+            errors.append(pose)
+        elif pose is not None:
+            row = expected[sent.ticks[places[0]] % len(expected)].tolist()
+            distances.append(distance(pose, row))
+            angles.append(rotation_angle(pose, row))
+    return {
+        "compared": len(distances) - 1,
+        "most_m": max(distances),
+        "most_rad": max(angles),
+        "errors": len(errors),
+        "first_error": next(iter(errors), None),
+    }
+
+
+def distance(pose: Sequence[float], other: Sequence[float]) -> float:
+    """The distance between two pose7 [m]."""
+    return float(np.linalg.norm(np.array(pose[:3]) - np.array(other[:3])))
+
+
+def rotation_angle(pose: Sequence[float], other: Sequence[float]) -> float:
+    """The angle between two pose7 [rad]."""
+    p, q = np.array(pose[3:]), np.array(other[3:])
+    # From the chord between the quaternions: the cosine cannot distinguish angles below 1e-8 from zero.
+    chord = min(float(np.linalg.norm(p - q)), float(np.linalg.norm(p + q)))
+    return 4.0 * float(np.arcsin(min(1.0, 0.5 * chord)))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate import RobotModel, SineSource, load_model
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.kinematics import Kinematics
 
 ROWS = 600
@@ -62,3 +65,19 @@ def deepest_link(model: RobotModel) -> str:
         return count
 
     return max(reversed(model.links), key=depth)
+
+
+def write_motion(path: Path, model: RobotModel, positions: NDArray[np.float64], **facts: object) -> None:
+    """Writes the files of a ``MotionFile``: edges, ``positions`` (N, nq), and the poses of moving edges."""
+    edges = [(joint.parent, joint.child) for joint in model.joints]
+    moves = np.array([joint.type != "fixed" for joint in model.joints])
+    poses = JointTransforms(model).poses(positions)
+    statics = [
+        (*edge, pose.tolist()) for edge, moved, pose in zip(edges, moves, poses[0], strict=True) if not moved
+    ]
+    moving = [edge for edge, moved in zip(edges, moves, strict=True) if moved]
+    head = {**facts, "count": len(positions), "edges": moving, "statics": statics}
+    path.with_suffix(".json").write_text(json.dumps(head), encoding="utf-8")
+    path.with_suffix(".urdf").write_text(model.urdf, encoding="utf-8")
+    np.ascontiguousarray(positions).tofile(path.with_suffix(".positions"))
+    np.ascontiguousarray(poses[:, moves]).tofile(path.with_suffix(".poses"))

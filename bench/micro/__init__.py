@@ -1,1 +1,1 @@
-"""Micro benchmarks: one operation each."""
+"""Micro benchmarks of the parts of zstate: ``python -m bench.micro`` lists them."""

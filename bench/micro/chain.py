@@ -1,121 +1,85 @@
 """The whole chain, two processes over loopback: rate, CPU and latency.
 
-    python -m bench.micro.chain [--robot panda] [--rates 50 100 500 1000] [--seconds 10]
+For each rate a new process runs ``StatePublisher.run`` with a sine, and another listens in one of two ways:
 
-For each rate a fresh publisher process runs ``StatePublisher.run`` with a sine, and a fresh reader
-process listens in one of two ways:
-
-- ``awake``: woken by every sample, it looks up the tip at that instant. Latency is measured from the stamp of
-  the sample to the return of the lookup;
+- ``woken``: by every sample, it looks up the tip at that instant. Latency is measured from the stamp of the
+  sample to the return of the lookup;
 - ``idle``: it looks up the tip once a second, as most programs do.
 
-CPU is the process's own (all threads) over the measured window, in % of one core; the window starts
-with the first answer of the reader.
+CPU is the process's own (all threads) over the measured window, which starts with the reader's first answer.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import resource
-import subprocess
-import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
-from bench.process import free_ports
+from bench.micro.form import Row, result_of, running_role, send_event, use_own_rendezvous
 from zstate import SineSource, StatePublisher, TransformListener, connect, load_model
 
 SETTLE_S = 1.0
 
 
-def main() -> None:
-    """Run one role of the chain, or the whole table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robot", default="panda")
-    parser.add_argument("--rates", type=float, nargs="+", default=[50.0, 100.0, 500.0, 1000.0])
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--role", choices=("publisher", "awake", "idle"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.role:
-        report = _publish(options) if options.role == "publisher" else _read(options)
-        print(json.dumps(report))
-    else:
-        _table(options)
+def measure(
+    robot: str = "panda", rates: tuple[float, ...] = (50.0, 100.0, 500.0, 1000.0), seconds: float = 10.0
+) -> Iterator[Row]:
+    """Rows of each rate and reader."""
+    use_own_rendezvous()
+    for rate in rates:
+        for how in ("woken", "idle"):
+            yield from run_chain(f"{robot} at {rate:g} Hz, {how} reader", robot, rate, seconds, how)
 
 
-def _table(options: argparse.Namespace) -> None:
-    print(f"{options.robot}, {options.seconds:g} s each; CPU in % of a core, latency in us")
-    head = ("rate Hz", "reader", "achieved Hz", "error %", "publisher", "reader CPU", "p50", "p99", "lost")
-    print("".join(f"{title:>12}" for title in head))
-    for rate in options.rates:
-        for role in ("awake", "idle"):
-            row = _run(options, rate, role)
-            print("".join(f"{cell:>12}" for cell in row), flush=True)
+def run_chain(title: str, robot: str, rate: float, seconds: float, how: str) -> Iterator[Row]:
+    """The rows of one publisher and one reader."""
+    with running_role(read, robot=robot, seconds=seconds, how=how) as reader:
+        with running_role(publish, robot=robot, rate=rate, seconds=seconds) as publisher:
+            sent = result_of(publisher, seconds + 60.0)
+        received = result_of(reader, seconds + 60.0)
+    yield Row(f"{title}: deviation of the rate", "%", [100.0 * (sent["rate_hz"] / rate - 1.0)])
+    yield Row(f"{title}: lost samples", "", [received["lost"]])
+    yield Row(f"{title}: CPU of the publisher", "% of a core", [sent["cpu_percent"]])
+    yield Row(f"{title}: CPU of the reader", "% of a core", [received["cpu_percent"]])
+    if received["latency_us"]:
+        yield Row(f"{title}: stamp to result", "us", received["latency_us"])
 
 
-def _run(options: argparse.Namespace, rate: float, role: str) -> list[str]:
-    environment = {**os.environ, "ZSTATE_RENDEZVOUS": f"127.0.0.1:{free_ports(1)[0]}"}
-    command = [sys.executable, "-m", "bench.micro.chain", "--robot", options.robot]
-    command += ["--rates", str(rate), "--seconds", str(options.seconds), "--role"]
-    reader = subprocess.Popen([*command, role], env=environment, stdout=subprocess.PIPE, text=True)
-    publisher = subprocess.Popen([*command, "publisher"], env=environment, stdout=subprocess.PIPE, text=True)
-    sent, received = (json.loads(process.communicate()[0]) for process in (publisher, reader))
-    error = 100.0 * (sent["rate_hz"] / rate - 1.0)
-    row = [f"{rate:g}", role, f"{sent['rate_hz']:.3f}", f"{error:+.4f}", f"{sent['cpu']:.1f}"]
-    row += [f"{received['cpu']:.1f}", _or_dash(received["p50_us"]), _or_dash(received["p99_us"])]
-    return [*row, str(received["lost"])]
-
-
-def _or_dash(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}"
-
-
-def _publish(options: argparse.Namespace) -> dict[str, Any]:
-    model = load_model(options.robot)
-    with connect() as session, StatePublisher(session, model, options.robot) as publisher:
+def publish(robot: str, rate: float, seconds: float) -> dict[str, Any]:
+    """Publishes a sine."""
+    model = load_model(robot)
+    with connect() as session, StatePublisher(session, model, robot) as publisher:
+        send_event("ready")
         source = SineSource(model)
-        publisher.run(source, options.rates[0], seconds=SETTLE_S)
-        start, cpu = time.monotonic(), _cpu_s()
-        report = publisher.run(source, options.rates[0], seconds=options.seconds)
-        cpu_percent = 100.0 * (_cpu_s() - cpu) / (time.monotonic() - start)
-        publisher.run(source, options.rates[0], seconds=SETTLE_S)
-    return {"rate_hz": report.rate_hz, "skipped": report.skipped, "cpu": cpu_percent}
+        publisher.run(source, rate, seconds=SETTLE_S)
+        begin, cpu_s = time.monotonic(), time.process_time()
+        report = publisher.run(source, rate, seconds=seconds)
+        cpu_percent = 100.0 * (time.process_time() - cpu_s) / (time.monotonic() - begin)
+        publisher.run(source, rate, seconds=SETTLE_S)
+    return {"rate_hz": report.rate_hz, "cpu_percent": cpu_percent}
 
 
-def _read(options: argparse.Namespace) -> dict[str, Any]:
-    model = load_model(options.robot)
-    root, tip = model.root, model.links[-1]
-    latencies: list[int] = []
-    with connect() as session, TransformListener(session, options.robot) as listener:
+def read(robot: str, seconds: float, how: str) -> dict[str, Any]:
+    """Listens from the first sample on."""
+    model = load_model(robot)
+    ends = model.root, model.links[-1]
+    latency_us: list[float] = []
+    with connect() as session, TransformListener(session, robot) as listener:
+        send_event("ready")
         buffer = listener.buffer
-        buffer.wait(root, tip, timeout_s=30.0)
-        deadline = time.monotonic() + options.seconds
-        start, cpu = time.monotonic(), _cpu_s()
-        newest = buffer.latest(root, tip)
-        while time.monotonic() < deadline:
-            if options.role == "idle":
+        buffer.wait(*ends, timeout_s=30.0)
+        begin, cpu_s = time.monotonic(), time.process_time()
+        newest = buffer.latest(*ends)
+        while time.monotonic() < begin + seconds:
+            if how == "idle":
                 time.sleep(1.0)
-                buffer.lookup(root, tip)
+                buffer.lookup(*ends)
             else:
-                buffer.wait(root, tip, newest + 1, timeout_s=1.0)
-                newest = buffer.latest(root, tip)
-                buffer.lookup(root, tip, newest)
-                latencies.append(time.time_ns() - newest)
-        cpu_percent = 100.0 * (_cpu_s() - cpu) / (time.monotonic() - start)
+                buffer.wait(*ends, newest + 1, timeout_s=1.0)
+                newest = buffer.latest(*ends)
+                buffer.lookup(*ends, newest)
+                latency_us.append((time.time_ns() - newest) * 1e-3)
+        cpu_percent = 100.0 * (time.process_time() - cpu_s) / (time.monotonic() - begin)
         stats = listener.stats
-    p50, p99 = np.percentile(latencies, (50, 99)) * 1e-3 if latencies else (None, None)
     lost = stats.missed + stats.dropped + sum(stats.refused.values())
-    return {"cpu": cpu_percent, "p50_us": p50, "p99_us": p99, "lost": lost, "received": stats.received}
-
-
-def _cpu_s() -> float:
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
-
-
-if __name__ == "__main__":
-    main()
+    return {"cpu_percent": cpu_percent, "latency_us": latency_us, "lost": lost}

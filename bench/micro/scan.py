@@ -1,30 +1,23 @@
 """Scans of a moving robot, placed in another process: how long after the pose that they need, and how many.
 
-    python -m bench.micro.scan [SECONDS]
-
 One process publishes a robot that drives and turns, at 100 Hz, and its laser: 1081 rays, 30 scans a second,
-each ray with its own stamp. A scan is published at the instant of its last ray, so that its reader needs the
-next sample of the transforms. This process iterates over a ScanListener.
-
-A latency is from the stamp of that sample, which is the time immediately before it is published, to the
-moment at which the placed scan is returned: sample, waiting thread, 1081 points, reading thread. The first
-line counts from the insertion of the sample into the reader's buffer. ``lost`` scans are gaps in the stamps,
-ticks that a busy writer skips included; ``dropped`` ones are those of ``ScanListener.dropped``.
+each ray with its own stamp. A scan is published at the instant of its last ray, so that its reader needs
+the next sample of the transforms. This process iterates over a ScanListener. A latency is from the stamp of
+that sample, which is the time immediately before it is published, to the moment at which the placed scan is
+returned. ``lost`` scans are gaps in the stamps, ticks that a busy writer skips included.
 """
 
 from __future__ import annotations
 
 import math
-import platform
-import sys
 import threading
 import time
 from bisect import bisect_left
+from collections.abc import Iterator
 
 import numpy as np
 
-import zstate
-from bench.micro.processes import running_process, use_own_rendezvous
+from bench.micro.form import Row, end_of_input, running_role, send_event, use_own_rendezvous
 from zstate import Transform, TransformListener, TransformPublisher, connect
 from zstate.scans import ScanListener, ScanPublisher
 
@@ -32,8 +25,6 @@ ROBOT = "rover"
 RAYS = 1081
 SCAN_HZ, POSE_HZ = 30.0, 100.0
 POSE_NS = round(1e9 / POSE_HZ)
-RAY_NS = round(1e9 / SCAN_HZ / 1440)
-SECONDS = 10.0
 WARM_UP_S = 1.0
 
 
@@ -58,29 +49,28 @@ class Room:
 
 
 def write() -> None:
-    """Publish both until the process is ended."""
-    geometry = {
-        "angle_min": -2.356,
-        "angle_increment": 4.712 / (RAYS - 1),
-        "range_min": 0.1,
-        "range_max": 10.0,
-    }
+    """Publishes both."""
+    turn = {"angle_min": -2.356, "angle_increment": 4.712 / (RAYS - 1), "range_min": 0.1, "range_max": 10.0}
+    ended = end_of_input()
     with (
         connect() as session,
         TransformPublisher(session, ROBOT, "odometry") as poses,
-        ScanPublisher(session, ROBOT, "laser", ray_ns=RAY_NS, **geometry) as scans,
+        ScanPublisher(session, ROBOT, "laser", ray_ns=round(1e9 / SCAN_HZ / 1440), **turn) as scans,
     ):
         threading.Thread(target=lambda: poses.run(Drive(), POSE_HZ), daemon=True).start()
-        print("publishing", flush=True)
-        scans.run(Room(), SCAN_HZ)
+        threading.Thread(target=lambda: scans.run(Room(), SCAN_HZ), daemon=True).start()
+        send_event("ready")
+        ended.wait()
 
 
-def read(seconds: float) -> None:
-    """Receive for ``seconds`` and print the figures."""
+def measure(seconds: float = 10.0) -> Iterator[Row]:
+    """Rows of the latencies and of what is lost."""
+    use_own_rendezvous()
     placed: list[tuple[int, int, int, int]] = []
     """Stamps of the first ray, the last ray and the sample; the time when the scan was returned."""
     inserted: list[int] = []
     with (
+        running_role(write),
         connect() as session,
         TransformListener(session, ROBOT) as listener,
         ScanListener(session, ROBOT, "odom", buffer=listener.buffer) as scans,
@@ -94,38 +84,15 @@ def read(seconds: float) -> None:
                 continue
             end, newest = one.scan.end_stamp, scans.buffer.latest("odom", "laser")
             # Of several samples since the last ray, the scan needs the first.
-            needed = newest - (newest - end) // POSE_NS * POSE_NS
-            placed.append((one.stamp, end, needed, now))
+            placed.append((one.stamp, end, newest - (newest - end) // POSE_NS * POSE_NS, now))
             if now > start + seconds * 1e9:
                 break
-        dropped = dict(scans.dropped)
-    latencies = np.array([now - needed for *_, needed, now in placed]) * 1e-6
-    arrivals = [inserted[bisect_left(inserted, needed)] for *_, needed, _ in placed]
-    handled = np.array([now - at for (*_, now), at in zip(placed, arrivals, strict=True)]) * 1e-6
-    waits = np.array([now - end for _, end, _, now in placed]) * 1e-6
-    gaps = np.diff([first for first, *_ in placed]) * 1e-9 * SCAN_HZ
-    lost = int(np.maximum(np.round(gaps) - 1, 0).sum())
-    print(f"zstate {zstate.__version__} ({zstate.kernel}), Python {platform.python_version()}, ", end="")
-    print(f"{platform.machine()}; {len(placed)} scans of {RAYS} rays in {seconds:g} s")
-    for what, values in (
-        ("after the sample is inserted", handled),
-        ("after the sample's stamp", latencies),
-        ("after the last ray", waits),
-    ):
-        p50, p90, p99 = np.percentile(values, (50, 90, 99))
-        print(f"placed {what:<30} p50 {p50:6.3f} ms  p90 {p90:6.3f} ms  p99 {p99:6.3f} ms")
-    print(f"lost {lost}, dropped {dropped or 0}")
-
-
-def main() -> None:
-    """Print the figures."""
-    if sys.argv[1:] == ["--write"]:
-        write()
-        return
-    use_own_rendezvous()
-    with running_process(sys.executable, "-m", "bench.micro.scan", "--write"):
-        read(float(sys.argv[1]) if len(sys.argv) > 1 else SECONDS)
-
-
-if __name__ == "__main__":
-    main()
+        dropped = sum(scans.dropped.values())
+    first, last, needed, returned = np.array(placed).T
+    at = np.array([inserted[bisect_left(inserted, stamp)] for stamp in needed.tolist()])
+    yield Row("placed after the sample is inserted", "ms", (returned - at) * 1e-6)
+    yield Row("placed after the sample's stamp", "ms", (returned - needed) * 1e-6)
+    yield Row("placed after the last ray", "ms", (returned - last) * 1e-6)
+    gaps = np.round(np.diff(first) * 1e-9 * SCAN_HZ) - 1
+    yield Row(f"lost of {len(placed)} scans", "", [float(np.maximum(gaps, 0).sum())])
+    yield Row("dropped", "", [dropped])

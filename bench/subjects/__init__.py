@@ -1,4 +1,4 @@
-"""The systems under test, one module each, found by name."""
+"""The systems under test: each module has its ``SUBJECTS``, and their roles are imported in the workers."""
 
 from __future__ import annotations
 
@@ -6,23 +6,11 @@ from importlib import import_module
 
 from bench.subjects.subject import Subject
 
-NAMES = (
-    "zstate_peer",
-    "zstate_router",
-    "zstate_ros2",
-    "zstate_mtls",
-    "ros1",
-    "ros1_cpp",
-    "ros1_default",
-    "ros2",
-    "cyclone",
-    "raw_zenoh",
-    "raw_zenoh_router",
-)
-"""Every subject, in the order of the reports."""
+MODULES = ("zstate_chain", "ros1", "ros2", "cyclone", "raw_zenoh")
+"""In the order of the tables."""
 
 
-def subject_named(name: str) -> Subject:
-    """The subject of ``bench/subjects/<name>.py``."""
-    subject: Subject = import_module(f"bench.subjects.{name}").SUBJECT
-    return subject
+def all_subjects() -> dict[str, Subject]:
+    """Every subject by its name."""
+    modules = (import_module(f"bench.subjects.{name}") for name in MODULES)
+    return {one.name: one for module in modules for one in module.SUBJECTS}

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import functools
-import subprocess
 from collections.abc import Mapping
 
-from bench.environments import environment_path, venv_python
 from bench.job import Job
-from bench.subjects.dds import DOMAIN_VARIABLE, NO_STATE_PUBLISHER, free_domain
-from bench.subjects.subject import Roles, Subject
+from bench.subjects.subject import Roles, Subject, environment_path, venv_python, versions_there
+from bench.subjects.tf_messages import DOMAIN_VARIABLE, NO_STATE_PUBLISHER, free_domain
 
-PACKAGE = "cyclonedds==11.0.1"
 # Loopback only; enough participants for any run.
 CONFIG = """
 <CycloneDDS><Domain Id="any">
@@ -28,11 +25,7 @@ CONFIG = """
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    code = "from importlib.metadata import version; print(version('cyclonedds'))"
-    result = subprocess.run(
-        [str(venv_python("cyclone")), "-c", code], check=True, capture_output=True, text=True
-    )
-    return {"cyclonedds": result.stdout.strip()}
+    return versions_there(venv_python("cyclone"), "cyclonedds")
 
 
 def _environment(job: Job) -> Mapping[str, str]:
@@ -45,25 +38,27 @@ def _load() -> Roles:
     return roles.Writer, roles.Reader
 
 
-SUBJECT = Subject(
-    name="cyclone",
-    title="Cyclone DDS messages, Python",
-    settings=(
-        "Eclipse Cyclone DDS from PyPI with ROS 2's IDL of the messages; unicast on loopback, peers named; "
-        "UDP, for the wheel has no shared memory",
-        "the writer publishes JointState (from one object for all samples, serialized by cyclonedds; "
-        "reliable, keep last 10) and TFMessage (reliable, keep last 100), static edges transient local; "
-        "XCDR1",
-        *NO_STATE_PUBLISHER,
-        "reader: a listener's on_data_available, in Cyclone's own receiving thread, takes the samples; it "
-        "does not subscribe to the joint states",
+SUBJECTS = (
+    Subject(
+        "cyclone",
+        "Cyclone DDS messages, Python",
+        (
+            "Eclipse Cyclone DDS from PyPI with ROS 2's IDL of the messages; unicast on loopback, peers "
+            "named; UDP, for the wheel has no shared memory",
+            "the writer publishes JointState (from one object for all samples, serialized by cyclonedds; "
+            "reliable, keep last 10) and TFMessage (reliable, keep last 100), static edges transient local; "
+            "XCDR1",
+            *NO_STATE_PUBLISHER,
+            "reader: a listener's on_data_available, in Cyclone's own receiving thread, takes the samples; "
+            "it does not subscribe to the joint states",
+        ),
+        (
+            f"python -m venv {environment_path('cyclone')}",
+            f"{environment_path('cyclone')}/bin/python -m pip install cyclonedds==11.0.1",
+        ),
+        python=lambda: venv_python("cyclone"),
+        versions=_versions,
+        load=_load,
+        environment=_environment,
     ),
-    install=(
-        f"python -m venv {environment_path('cyclone')}",
-        f"{environment_path('cyclone')}/bin/python -m pip install {PACKAGE}",
-    ),
-    python=lambda: venv_python("cyclone"),
-    versions=_versions,
-    load=_load,
-    environment=_environment,
 )

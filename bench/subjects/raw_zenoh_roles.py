@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
+from functools import partial
 
 import zenoh
 
 from bench.job import Job
-from bench.subjects.subject import Answered
+from bench.subjects.subject import Answered, Roles
 
 # Bytes of zstate's joint states besides the numbers: stamp, seq, session, digest and their headers.
 OVERHEAD = 34
 STAMP = struct.Struct("<q")
 
+Settings = Callable[[Job, str], dict[str, object]]
+"""The settings of the session of a "writer" or a "reader"."""
 
-def settings(job: Job, *, listens: bool) -> dict[str, object]:
-    """Settings of a peer that listens at the job's first port, or connects to it."""
+_SHARED: list[zenoh.Session] = []
+"""The session of the writers of this process, if they share one."""
+
+
+def as_peer(job: Job, role: str) -> dict[str, object]:
+    """Settings of a writer that listens at the job's first port, and of readers that connect to it."""
     endpoint = f"tcp/127.0.0.1:{job.ports[0]}"
     return {
         "mode": "peer",
         "scouting/multicast/enabled": False,
-        "connect/endpoints": [] if listens else [endpoint],
-        "listen/endpoints": [endpoint] if listens else ["tcp/127.0.0.1:0"],
+        "connect/endpoints": [] if role == "writer" else [endpoint],
+        "listen/endpoints": [endpoint] if role == "writer" else ["tcp/127.0.0.1:0"],
     }
 
 
@@ -31,32 +39,26 @@ def through_router(job: Job, role: str) -> dict[str, object]:
     return {"mode": "client", "connect/endpoints": [f"tcp/127.0.0.1:{job.router_port(role)}"]}
 
 
-_SHARED: list[zenoh.Session] = []
-"""The session of the writers of this process, if they share one."""
+def roles(settings: Settings) -> Roles:
+    """Writer and Reader whose sessions have ``settings``."""
+    return partial(Writer, settings), partial(Reader, settings)
 
 
-def writer_session(job: Job, config: dict[str, object]) -> zenoh.Session:
-    """A session of its own, or the one of all writers of this process."""
-    if not job.one_link:
-        return open_session(config)
-    if not _SHARED:
-        _SHARED.append(open_session(config))
-    return _SHARED[0]
-
-
-def open_session(config: dict[str, object]) -> zenoh.Session:
+def open_session(settings: dict[str, object]) -> zenoh.Session:
     """A session with exactly these settings."""
-    zenoh_config = zenoh.Config()
-    for path, value in config.items():
-        zenoh_config.insert_json5(path, json.dumps(value))
-    return zenoh.open(zenoh_config)
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return zenoh.open(config)
 
 
 class Writer:
     """Publishes bytes."""
 
-    def __init__(self, job: Job, config: dict[str, object] | None = None) -> None:
-        self._session = writer_session(job, settings(job, listens=True) if config is None else config)
+    def __init__(self, settings: Settings, job: Job) -> None:
+        if job.one_link and not _SHARED:
+            _SHARED.append(open_session(settings(job, "writer")))
+        self._session = _SHARED[0] if job.one_link else open_session(settings(job, "writer"))
         self._publisher = self._session.declare_publisher(f"bench/{job.robot}/joint_states")
         numbers = [struct.pack(f"<{len(row)}d", *row) for row in job.rows]
         self._tails = [bytes(OVERHEAD - STAMP.size) + block for block in numbers]
@@ -65,16 +67,19 @@ class Writer:
         """Publishes the stamp and the prepared bytes."""
         self._publisher.put(STAMP.pack(stamp) + self._tails[row])
 
+    def latch(self, number: int) -> None:
+        """Nothing: it has no latched values."""
+
     def close(self) -> None:
-        """Close the session."""
+        """Closes the session."""
         self._session.close()
 
 
 class Reader:
     """Reads the stamp from the bytes."""
 
-    def __init__(self, job: Job, answered: Answered, config: dict[str, object] | None = None) -> None:
-        self._session = open_session(settings(job, listens=False) if config is None else config)
+    def __init__(self, settings: Settings, job: Job, answered: Answered) -> None:
+        self._session = open_session(settings(job, "reader"))
         self._answered = answered
         self._received: set[int] = set()
         self._robot_count = len(job.followed)
@@ -97,6 +102,10 @@ class Reader:
         """Whether a sample of each robot has been received; it has no tree."""
         return len(self._received) == self._robot_count
 
+    def latched(self, number: int) -> int:
+        """The number of robots: there is nothing that could be missing."""
+        return self._robot_count
+
     def close(self) -> None:
-        """Close the session."""
+        """Closes the session."""
         self._session.close()

@@ -1,6 +1,5 @@
-// A tf2_ros listener in C++ that calls back when its buffer answers; a library, so that it can run
-// in the harness's reader process. All functions but ros1_listen are for any thread. Compiled as
-// ros1_cpp.py sets.
+// A tf2_ros listener in C++ that calls back when its buffer answers; a library, so that it can run in the harness's
+// reader process. All functions but ros1_listen are for any thread. Compiled as ros1.py sets.
 #include <ros/callback_queue.h>
 #include <ros/ros.h>
 #include <tf2_msgs/TFMessage.h>
@@ -21,62 +20,33 @@ using Answered = void (*)(std::int64_t stamp);
 
 constexpr int kQueue = 100; // what tf2_ros's listener has
 
-ros::Time
-time_of(std::int64_t stamp)
-{
-    return ros::Time(static_cast<std::uint32_t>(stamp / 1000000000),
-                     static_cast<std::uint32_t>(stamp % 1000000000));
-}
-
-class Listener {
-  public:
+struct Listener {
     Listener(const char *base, const char *tip, Answered answered)
         : base_(base), tip_(tip), answered_(answered),
           listener_(buffer_, node_, false, ros::TransportHints().tcpNoDelay()),
-          // Callbacks of a topic are queued in the order of their subscription, and one thread
-          // serves them.
-          woken_(node_.subscribe("/tf", kQueue, &Listener::take, this,
-                                 ros::TransportHints().tcpNoDelay())),
-          thread_([this] { serve(); })
-    {
-    }
+          // Callbacks of a topic are queued in the order of their subscription, and one thread serves them.
+          woken_(node_.subscribe("/tf", kQueue, &Listener::take, this, ros::TransportHints().tcpNoDelay())),
+          thread_([this] {
+              while (!is_closed_)
+                  ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.1));
+          }) {}
 
-    ~Listener()
-    {
+    ~Listener() {
         is_closed_ = true;
         thread_.join();
     }
 
-    geometry_msgs::Transform
-    lookup(std::int64_t stamp) const
-    {
-        return buffer_.lookupTransform(base_, tip_, time_of(stamp)).transform;
+    geometry_msgs::Transform lookup(std::int64_t stamp) const {
+        ros::Time time;
+        return buffer_.lookupTransform(base_, tip_, time.fromNSec(static_cast<std::uint64_t>(stamp))).transform;
     }
 
-    bool
-    knows(const char *link) const
-    {
-        return buffer_.canTransform(base_, link, ros::Time(0));
-    }
-
-  private:
-    void
-    serve()
-    {
-        while (!is_closed_)
-            ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.1));
-    }
-
-    void
-    take(const tf2_msgs::TFMessage::ConstPtr &message)
-    {
-        const ros::Time at = message->transforms.front().header.stamp;
-        const std::int64_t stamp = static_cast<std::int64_t>(at.toNSec());
+    void take(const tf2_msgs::TFMessage::ConstPtr &message) {
+        const auto stamp = static_cast<std::int64_t>(message->transforms.front().header.stamp.toNSec());
         try {
             lookup(stamp);
         } catch (const tf2::TransformException &) {
-            return; // static edges may come after moving ones; what is never answered is counted as
-                    // lost
+            return; // static edges may come after moving ones; what is never answered is counted as lost
         }
         answered_(stamp);
     }
@@ -97,20 +67,15 @@ std::unique_ptr<Listener> listener;
 
 extern "C" {
 
-void
-ros1_listen(const char *base, const char *tip, Answered answered)
-{
-    ros::init(ros::M_string(), "bench",
-              ros::init_options::NoSigintHandler | ros::init_options::AnonymousName |
-                  ros::init_options::NoRosout);
+void ros1_listen(const char *base, const char *tip, Answered answered) {
+    using ros::init_options::AnonymousName, ros::init_options::NoRosout, ros::init_options::NoSigintHandler;
+    ros::init(ros::M_string(), "bench", NoSigintHandler | AnonymousName | NoRosout);
     ros::start();
     listener = std::make_unique<Listener>(base, tip, answered);
 }
 
 // x y z qx qy qz qw of the tip in the base; false when the buffer has no answer.
-bool
-ros1_pose(std::int64_t stamp, double *pose)
-{
+bool ros1_pose(std::int64_t stamp, double *pose) {
     try {
         const auto found = listener->lookup(stamp);
         const auto &t = found.translation;
@@ -123,15 +88,11 @@ ros1_pose(std::int64_t stamp, double *pose)
     }
 }
 
-bool
-ros1_knows(const char *link)
-{
-    return listener->knows(link);
+bool ros1_knows(const char *link) {
+    return listener->buffer_.canTransform(listener->base_, link, ros::Time(0));
 }
 
-void
-ros1_close()
-{
+void ros1_close() {
     listener.reset();
     ros::shutdown();
 }

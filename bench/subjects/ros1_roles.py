@@ -1,7 +1,8 @@
-"""A writer of joint states and a tf2_ros listener, both of ROS 1 in Python."""
+"""A writer of joint states and tf2_ros listeners, all of ROS 1."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,15 +12,13 @@ from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
 from bench.job import Job
+from bench.subjects.ros1 import LISTENER
 from bench.subjects.subject import Answered
-from bench.subjects.wakeup_reader import WakeupReader
-
-NAME = "bench"
 
 
 def start_node() -> None:
     """Starts the node of this process; a late joiner starts it with its session."""
-    rospy.init_node(NAME, anonymous=True, disable_signals=True, disable_rosout=True)
+    rospy.init_node("bench", anonymous=True, disable_signals=True, disable_rosout=True)
 
 
 class Writer:
@@ -53,16 +52,13 @@ class Reader:
         self._base, self._tip, self._links = job.base, job.tip, job.links
         self._answered = answered
         self._buffer = tf2_ros.Buffer()
-        self._wakeup = WakeupReader(job, self._answer)
         self._listener = tf2_ros.TransformListener(self._buffer, tcp_nodelay=nodelay)
         # Subscribers of a topic share its connection and are called in the order of their registration.
         self._subscriber = rospy.Subscriber("/tf", TFMessage, self._on_transforms, tcp_nodelay=nodelay)
 
     def _on_transforms(self, message: Any) -> None:
         at = message.transforms[0].header.stamp
-        self._wakeup.on_sample(at.secs * 10**9 + at.nsecs)
-
-    def _answer(self, stamp: int) -> None:
+        stamp = at.secs * 10**9 + at.nsecs
         try:
             self._lookup(stamp)
         except tf2_ros.TransformException:
@@ -86,5 +82,31 @@ class Reader:
 
     def close(self) -> None:
         """Leaves the master."""
-        self._wakeup.close()
         rospy.signal_shutdown("done")
+
+
+class CppReader:
+    """The library ros1_listener.cpp, which holds the buffer; one reader per process."""
+
+    def __init__(self, job: Job, answered: Answered) -> None:
+        self._library = ctypes.CDLL(str(LISTENER))
+        self._library.ros1_pose.argtypes = (ctypes.c_int64, ctypes.POINTER(ctypes.c_double))
+        self._library.ros1_pose.restype = self._library.ros1_knows.restype = ctypes.c_bool
+        self._links = [link.encode() for link in job.links]
+        self._answered = ctypes.CFUNCTYPE(None, ctypes.c_int64)(answered)  # the library keeps no reference
+        self._library.ros1_listen(job.base.encode(), job.tip.encode(), self._answered)
+
+    def pose(self, stamp: int, robot: int = 0) -> Sequence[float]:
+        """Looks up the pose in the buffer."""
+        numbers = (ctypes.c_double * 7)()
+        if not self._library.ros1_pose(stamp, numbers):
+            raise LookupError(f"tf2 has no pose at {stamp}")
+        return tuple(numbers)
+
+    def has_tree(self) -> bool:
+        """Whether the buffer has every link."""
+        return all(self._library.ros1_knows(link) for link in self._links)
+
+    def close(self) -> None:
+        """Leaves the master."""
+        self._library.ros1_close()

@@ -4,19 +4,11 @@ from __future__ import annotations
 
 import functools
 import os
-import subprocess
 from collections.abc import Mapping
 
-from bench.environments import environment_path, venv_python
 from bench.job import Job
-from bench.subjects.dds import NO_STATE_PUBLISHER, free_domain
-from bench.subjects.subject import Roles, Subject
-
-VERSIONS = """
-from importlib.metadata import version
-for name in ("ros-kilted-rclpy", "ros-rmw-fastrtps-cpp", "ros-fastdds"):
-    print(name, version(name))
-"""
+from bench.subjects.subject import Roles, Subject, environment_path, venv_python, versions_there
+from bench.subjects.tf_messages import NO_STATE_PUBLISHER, free_domain
 
 
 def _python() -> str | None:
@@ -26,10 +18,7 @@ def _python() -> str | None:
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    output = subprocess.run(
-        [str(_python()), "-c", VERSIONS], check=True, capture_output=True, text=True
-    ).stdout
-    return dict(line.split() for line in output.splitlines())
+    return versions_there(_python(), "ros-kilted-rclpy", "ros-rmw-fastrtps-cpp", "ros-fastdds")
 
 
 def _environment(job: Job) -> Mapping[str, str]:
@@ -47,25 +36,28 @@ def _load() -> Roles:
     return roles.Writer, roles.Reader
 
 
-SUBJECT = Subject(
-    name="ros2",
-    title="ROS 2 messages, rclpy on Fast DDS",
-    settings=(
-        "ROS 2 Kilted's own rclpy and Fast DDS, discovery LOCALHOST, Fast DDS's default transports: shared "
-        "memory on, so that most bytes do not appear on loopback",
-        "the writer publishes sensor_msgs/JointState (rclpy, one message object for all samples, reliable, "
-        "depth 10) and tf2_msgs/TFMessage on /tf (reliable, depth 100) and /tf_static (transient local)",
-        *NO_STATE_PUBLISHER,
-        "reader: rclpy.spin of the default single-threaded executor; /tf reliable, depth 100, as in "
-        "tf2_ros; it does not subscribe to the joint states. Kilted's experimental EventsExecutor is not "
-        "used: spun outside the main thread, it blocked the process",
+SUBJECTS = (
+    Subject(
+        "ros2",
+        "ROS 2 messages, rclpy on Fast DDS",
+        (
+            "ROS 2 Kilted's own rclpy and Fast DDS, discovery LOCALHOST, Fast DDS's default transports: "
+            "shared memory on, so that most bytes do not appear on loopback",
+            "the writer publishes sensor_msgs/JointState (rclpy, one message object for all samples, "
+            "reliable, depth 10) and tf2_msgs/TFMessage on /tf (reliable, depth 100) and /tf_static "
+            "(transient local)",
+            *NO_STATE_PUBLISHER,
+            "reader: rclpy.spin of the default single-threaded executor; /tf reliable, depth 100, as in "
+            "tf2_ros; it does not subscribe to the joint states. Kilted's experimental EventsExecutor is not "
+            "used: spun outside the main thread, it blocked the process",
+        ),
+        (
+            "apt-get install -y --no-install-recommends g++",
+            f"python tests/helpers/ros2/oracles.py kilted {environment_path('ros2')}",
+        ),
+        python=_python,
+        versions=_versions,
+        load=_load,
+        environment=_environment,
     ),
-    install=(
-        "apt-get install -y --no-install-recommends g++",
-        f"python tests/helpers/ros2/oracles.py kilted {environment_path('ros2')}",
-    ),
-    python=_python,
-    versions=_versions,
-    load=_load,
-    environment=_environment,
 )

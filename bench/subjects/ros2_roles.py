@@ -15,8 +15,7 @@ from tf2_msgs.msg import TFMessage
 
 from bench.job import Job
 from bench.subjects.subject import Answered
-from bench.subjects.tf_messages import TfBytes
-from bench.subjects.tf_reader import TfReader
+from bench.subjects.tf_messages import TfBytes, TfReader
 
 JOINTS = QoSProfile(depth=10)
 TF = QoSProfile(depth=100)
@@ -59,8 +58,8 @@ class Reader(TfReader):
         rclpy.init()
         node = rclpy.create_node("bench_reader")
         self._subscriptions = [
-            node.create_subscription(TFMessage, "/tf", self._on_transforms, TF),
-            node.create_subscription(TFMessage, "/tf_static", self._history.add_statics, LATCHED),
+            node.create_subscription(TFMessage, "/tf", self.on_transforms, TF),
+            node.create_subscription(TFMessage, "/tf_static", self.on_statics, LATCHED),
         ]
         self._thread = threading.Thread(target=self._spin, args=(node,), daemon=True)
         self._thread.start()
@@ -71,6 +70,5 @@ class Reader(TfReader):
 
     def close(self) -> None:
         """Leaves the domain."""
-        super().close()
         rclpy.shutdown()
         self._thread.join()

@@ -1,16 +1,24 @@
 """The protocol between the harness and a system under test; standard library only.
 
-One module per system, with a ``SUBJECT`` and no heavy import at module level: the runner imports all of them,
-even if the system is not installed. Imports of the system itself belong in ``load``.
+A module has ``SUBJECTS`` and no heavy import at module level: the runner imports all of them, even if the
+system is not installed. Imports of the system itself belong in ``load``.
 """
 
 from __future__ import annotations
 
+import os
+import shlex
+import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from bench.job import Job
+
+HOME = os.environ.get("ZSTATE_BENCH_HOME", ".bench")
+ENVIRONMENTS = Path(__file__).parents[2] / HOME
+"""The environments of other systems."""
 
 Answered: TypeAlias = "Callable[..., None]"
 """``answered(stamp)``, or ``answered(stamp, robot)`` in a fleet: see ``Reader``."""
@@ -38,8 +46,8 @@ class Reader(Protocol):
     arrival, by the fastest mechanism that the system documents. In a fleet it calls ``answered(stamp, n)``
     with the index of the robot in ``job.robots``.
 
-    Under the load "slow" ``answered`` sleeps: a system that fills its buffer in its own thread then calls it
-    from another thread, which answers the newest sample in a loop, as its user's program would.
+    Of a subject that soaks, a writer also has ``latch(number)``, which publishes a value that late joiners
+    receive, and a reader ``latched(number)``, how many robots have that value.
     """
 
     def pose(self, stamp: int, robot: int = 0) -> Sequence[float] | None:
@@ -69,21 +77,10 @@ class Service:
 
     role: str
     command: tuple[str, ...]
-    environment: Mapping[str, str] = field(default_factory=dict)
     ready_text: str = ""
     port: int = 0
     probe: tuple[str, ...] = ()
     within_s: float = 20.0
-
-
-def no_services(job: Job) -> Sequence[Service]:
-    """No services."""
-    return ()
-
-
-def no_environment(job: Job) -> Mapping[str, str]:
-    """No variables besides the runner's own environment."""
-    return {}
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ class Subject:
     - ``load``: imports the system, in the worker's process, and returns its Writer and Reader;
     - ``services(job)``: started in this order, before writers and readers; ``environment(job)`` is added to
       the environment of all of them. Both may use ``job.ports`` (six of them) and write into ``job.folder``;
-    - ``fleet``: whether one reader can follow many robots. ``floor``: it does no work, for comparison.
+    - ``fleet``: whether one reader can follow many robots, and soak. ``floor``: it computes no poses.
     """
 
     name: str
@@ -107,7 +104,25 @@ class Subject:
     python: Callable[[], str | None]
     versions: Callable[[], dict[str, str]]
     load: Callable[[], Roles]
-    services: Callable[[Job], Sequence[Service]] = no_services
-    environment: Callable[[Job], Mapping[str, str]] = no_environment
+    services: Callable[[Job], Sequence[Service]] = field(default=lambda job: ())
+    environment: Callable[[Job], Mapping[str, str]] = field(default=lambda job: {})
     fleet: bool = False
     floor: bool = False
+
+
+def environment_path(name: str) -> str:
+    """The path of the environment ``name``, quoted for a command that is run in the checkout."""
+    return shlex.quote(f"{HOME}/{name}")
+
+
+def venv_python(name: str) -> str | None:
+    """The interpreter of the environment ``name``, as made by ``python -m bench setup``; None if absent."""
+    python = ENVIRONMENTS / name / "bin" / "python"
+    return str(python) if python.exists() else None
+
+
+def versions_there(python: str | None, *packages: str) -> dict[str, str]:
+    """The versions of ``packages`` in the environment of the interpreter ``python``."""
+    code = f"from importlib.metadata import version\nfor one in {packages}: print(one, version(one))"
+    done = subprocess.run([str(python), "-c", code], check=True, capture_output=True, text=True)
+    return dict(line.split() for line in done.stdout.splitlines())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,13 +10,15 @@ import numpy as np
 
 from bench.job import Job
 from bench.subjects.subject import Answered, Roles
-from zstate import StatePublisher, Transform, TransformBuffer, TransformListener, load_model
-from zstate._util.closeable import Closeable
-from zstate.errors import LookupFailed
+from zstate import StatePublisher, StaticPublisher, Transform, TransformBuffer, TransformListener, load_model
+from zstate.errors import ZStateError
 from zstate.net.session import Session
 
 Connect = Callable[[Job, str], Session]
 """``connect(job, role)``: the session of a "writer" or a "reader"."""
+
+_SHARED: list[Session] = []
+"""The session of the writers of this process, if they share one."""
 
 
 def roles(connect: Connect, wire: str = "native") -> Roles:
@@ -25,38 +26,37 @@ def roles(connect: Connect, wire: str = "native") -> Roles:
     return partial(Writer, connect, wire), partial(Reader, connect, wire)
 
 
-_SHARED: list[Session] = []
-"""The session of the writers of this process, if they share one."""
-
-
-def _writer_session(connect: Connect, job: Job) -> Session:
-    """A session of its own, or the one of all writers of this process."""
-    if not job.one_link:
-        return connect(job, "writer")
-    if not _SHARED:
-        _SHARED.append(connect(job, "writer"))
-    return _SHARED[0]
-
-
-class Writer(Closeable):
+class Writer:
     """Publishes positions and a stamp with a ``StatePublisher``."""
 
     def __init__(self, connect: Connect, wire: str, job: Job) -> None:
-        model = load_model(Path(job.urdf))
-        columns = [job.joints.index(name) for name in model.joint_names]
+        self._model = load_model(Path(job.urdf))
+        columns = [job.joints.index(name) for name in self._model.joint_names]
         self._rows = list(np.array(job.rows)[:, columns])
-        self._session = _writer_session(connect, job)
-        self._publisher = StatePublisher(self._session, model, job.robot, wires=(wire,))
+        if job.one_link and not _SHARED:
+            _SHARED.append(connect(job, "writer"))
+        self._session = _SHARED[0] if job.one_link else connect(job, "writer")
+        self._publisher = StatePublisher(self._session, self._model, job.robot, wires=(wire,))
+        self._marks = StaticPublisher(self._session, job.robot, "mark") if job.soaks else None
 
     def send(self, row: int, stamp: int) -> None:
         self._publisher.publish(self._rows[row], stamp=stamp)
 
+    def latch(self, number: int) -> None:
+        """Sets a static edge whose length is ``number``."""
+        assert self._marks is not None
+        self._marks.set(
+            Transform.from_rpy(self._model.root, "mark", (float(number), 0.0, 0.0), (0.0, 0.0, 0.0))
+        )
+
     def close(self) -> None:
+        if self._marks is not None:
+            self._marks.close()
         self._publisher.close()
         self._session.close()
 
 
-class Reader(Closeable):
+class Reader:
     """A ``TransformListener``; its buffer's ``watch`` calls it, and it looks up that stamp.
 
     The watch already delivers the answer; the lookup is repeated for comparability with other systems.
@@ -70,31 +70,14 @@ class Reader(Closeable):
         robots = job.followed if job.follows or len(job.robots) == 1 else "*"
         self._listener = TransformListener(self._session, robots, self._buffer, wire=wire)
         self._ends = [(f"{robot}/{job.base}", f"{robot}/{job.tip}") for robot in job.followed]
-        self._closed = threading.Event()
-        if job.load == "slow":
-            threading.Thread(target=self._loop, daemon=True).start()
-        else:
-            self._watches = [
-                self._buffer.watch(*ends, partial(self._answer, ends, number))
-                for number, ends in enumerate(self._ends)
-            ]
+        self._watches = [
+            self._buffer.watch(*ends, partial(self._answer, ends, number))
+            for number, ends in enumerate(self._ends)
+        ]
 
     def _answer(self, ends: tuple[str, str], robot: int, newest: Transform) -> None:
         self._buffer.lookup(*ends, newest.stamp)
         self._answered(newest.stamp, robot)
-
-    def _loop(self) -> None:
-        """The loop of a slow user: waits for a newer sample, then looks up the newest."""
-        ends, newest = self._ends[0], None
-        while not self._closed.is_set():
-            try:
-                self._buffer.wait(*ends, newest, timeout_s=0.5)
-            except LookupFailed:
-                continue
-            stamp = self._buffer.latest(*ends)
-            self._buffer.lookup(*ends, stamp)
-            self._answered(stamp)
-            newest = stamp + 1
 
     def pose(self, stamp: int, robot: int = 0) -> list[float]:
         return self._buffer.lookup(*self._ends[robot], stamp).pose7.tolist()
@@ -107,7 +90,16 @@ class Reader(Closeable):
             for link in reversed(job.links)
         )
 
+    def latched(self, number: int) -> int:
+        """How many robots have the static edge of ``number``."""
+        return sum(self._mark(base) == number for base, _ in self._ends)
+
+    def _mark(self, base: str) -> float | None:
+        try:
+            return float(self._buffer.lookup(base, f"{base.partition('/')[0]}/mark").translation[0])
+        except ZStateError:  # not received yet
+            return None
+
     def close(self) -> None:
-        self._closed.set()
         self._listener.close()
         self._session.close()

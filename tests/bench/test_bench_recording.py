@@ -8,8 +8,18 @@ from math import ceil
 import numpy as np
 import pytest
 
-from bench.poses import distance, pose_errors, rotation_angle
-from bench.recording import GRID, Recording, Window, latency_grid, percentile, rate_in, reader_figures
+from bench.recording import (
+    GRID,
+    Recording,
+    Window,
+    distance,
+    latency_grid,
+    percentile,
+    pose_errors,
+    rate_in,
+    reader_figures,
+    rotation_angle,
+)
 
 SECOND = 10**9
 BEGIN = 1_789_012_345_678_901_234
@@ -71,7 +81,6 @@ def test_answers_after_more_than_a_period_are_late() -> None:
     times = [BEGIN + 10_000_000, BEGIN + 1 + 10_000_001, BEGIN + 2 + 30_000_000]
     sent, answered = recording(stamps), recording(stamps, times=times)
     assert reader_figures(sent, answered, WINDOW, 100.0)["late"] == 2
-    assert reader_figures(sent, answered, WINDOW, 0.0)["late"] is None
 
 
 def test_writer_files_yield_robot_and_tick_of_each_sample(tmp_path) -> None:

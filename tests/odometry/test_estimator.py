@@ -89,7 +89,7 @@ def health_of(base: BaseEstimator, name: str) -> SourceHealth:
 @pytest.mark.long
 @pytest.mark.parametrize("runs", [10, pytest.param(25, marks=pytest.mark.soak)])
 def test_errors_are_as_large_as_their_covariances_with_a_source_late_and_shuffled(runs: int):
-    """Runs of 6 s in 3D, from rest, with a turned IMU; ``bench/micro/odometry.py`` has 100."""
+    """Runs of 6 s in 3D, from rest, with a turned IMU."""
     errors: list[tuple[float, float, float]] = []
     for seed in range(runs):
         motion, calls = calls_of(seed, 6.0)

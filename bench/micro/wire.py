@@ -1,22 +1,18 @@
-"""Cost of the ROS 2 wire: a JointState of 30 joints from arrays to bytes passed to Zenoh, and back.
+"""The wires: a JointState of 30 joints from arrays to bytes passed to Zenoh, and back.
 
-    python -m bench.micro.ros2_wire
-
-Thread CPU time [us] in interleaved rounds: medians, 99th percentiles, and the difference and ratio of the
-median to the put of the same bytes on a plain Zenoh publisher, with a reader on loopback. Each write follows
-a pause, as in a control loop, and is repeated back to back. Reading is measured without a network: from
-payload and attachment to a message, and on into a listener's buffer. The native wire is measured in the same
-way.
+A write follows a pause, as in a control loop; it is compared with the put of the same bytes on a plain Zenoh
+publisher, with a reader on loopback. Reading is measured without a network: from payload and attachment to a
+message, and on into a listener's buffer.
 """
 
 from __future__ import annotations
 
-import platform
+from collections.abc import Iterator
 from itertools import count
 
 import numpy as np
 
-from bench.micro.timing import Call, call_times_us
+from bench.micro.form import Call, Row, call_times_us, chain_urdf, compared
 from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_model
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
@@ -31,38 +27,22 @@ from zstate.wire.protocol import SerializedSample, WriterNode
 from zstate.wire.registry import get_wire
 
 JOINTS = 30
-ROUNDS = 31
 CALLS = 100
 PAUSE_S = 0.0005
 STAMP = 1_700_000_000_123_456_789
 
 
-def main() -> None:
-    """Print the tables."""
-    model = chain(JOINTS)
-    print(
-        f"Python {platform.python_version()}, numpy {np.__version__}, {platform.machine()}; us of thread CPU"
-    )
+def measure(rounds: int = 31) -> Iterator[Row]:
+    """Rows of both wires."""
+    model = load_model(chain_urdf(JOINTS))
     with connect() as session, connect() as other:
         reader = other.zenoh.declare_subscriber("**", lambda _: None)
         for wire in ("ros2", "native"):
-            cases = write_cases(wire, session, model)
-            for pause_s in (PAUSE_S, 0.0):
-                times = call_times_us(cases, ROUNDS, CALLS, pause_s=pause_s)
-                print_table(f"{wire}, writing {'after a pause' if pause_s else 'back to back'}", times)
-            print_table(f"{wire}, reading", call_times_us(read_cases(wire, model), ROUNDS, CALLS))
+            writing = call_times_us(write_cases(wire, session, model), rounds, CALLS, pause_s=PAUSE_S)
+            yield from compared(f"{wire}, writing", "us", writing)
+            reading = call_times_us(read_cases(wire, model, (rounds + 1) * CALLS), rounds, CALLS)
+            yield from compared(f"{wire}, reading", "us", reading)
         reader.undeclare()
-
-
-def chain(joints: int) -> RobotModel:
-    """A chain of revolute joints."""
-    links = "".join(f'<link name="link_{number}"/>' for number in range(joints + 1))
-    revolute = "".join(
-        f'<joint name="left_arm_joint_{number}" type="continuous"><parent link="link_{number}"/>'
-        f'<child link="link_{number + 1}"/><axis xyz="0 0 1"/></joint>'
-        for number in range(joints)
-    )
-    return load_model(f'<robot name="chain">{links}{revolute}</robot>')
 
 
 def write_cases(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
@@ -81,19 +61,17 @@ def write_cases(wire: str, session: Session, model: RobotModel) -> dict[str, Cal
     }
 
 
-def read_cases(wire: str, model: RobotModel) -> dict[str, Call]:
-    """The cases of decoding consecutive samples, and of inserting them into a buffer."""
+def read_cases(wire: str, model: RobotModel, calls: int) -> dict[str, Call]:
+    """The cases of decoding ``calls`` consecutive samples, and of inserting them into a buffer."""
     wire_format = get_wire(wire)
     node = WriterNode("r1", local_writer(1), "1", 0, sample_names(model))
     encoder = wire_format.stream_encoder(node, "joint_states", number=1)
     stamps = count(STAMP, 10_000_000)
 
     def arrivals() -> list[SerializedSample]:
-        payloads = [encoder.encode(sample(model, next(stamps))) for _ in range((ROUNDS + 1) * CALLS)]
-        return [
-            SerializedSample(encoder.key, one, encoder.encoding, encoder.attachment(STAMP))
-            for one in payloads
-        ]
+        payloads = [encoder.encode(sample(model, next(stamps))) for _ in range(calls)]
+        attachment = encoder.attachment and encoder.attachment(STAMP)
+        return [SerializedSample(encoder.key, one, encoder.encoding, attachment) for one in payloads]
 
     ingest = JointStateIngest("r1", FrameOwnership(TransformBuffer(), Counters()))
     ingest.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
@@ -119,18 +97,3 @@ def sample(model: RobotModel, stamp: int) -> JointState:
     """Positions and velocities, in the model's order."""
     block = to_block(np.linspace(-1.0, 1.0, model.position_count))
     return JointState(stamp, 0, 1, order_digest(model.joint_names), block, block)
-
-
-def print_table(what: str, times: dict[str, list[float]]) -> None:
-    """Prints one table; all rows are compared with the first."""
-    print(f"\n{what:<36}{'median':>9}{'p99':>9}{'above':>9}{'ratio':>9}")
-    floor = float(np.median(next(iter(times.values()))))
-    for case, values in times.items():
-        median, p99 = np.percentile(values, (50, 99))
-        print(
-            f"  {case:<34}{median:>9.1f}{p99:>9.1f}{median - floor:>9.1f}{median / floor:>9.2f}", flush=True
-        )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,1 +1,0 @@
-"""Lookups, side by side with other transform buffers: ``python -m bench.micro.lookup``."""

@@ -1,1 +1,0 @@
-"""Soak test: a fleet through one router for a long time (``python -m bench.soak``)."""
