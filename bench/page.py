@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.report import cell, figure_table, number, origin, table
-from bench.results import BYTES, CPU, FIGURES, MEMORY, MICRO, P50, ROOT, Figure, Results, Spread, git
+from bench.results import CPU, FIGURES, MEMORY, MICRO, P50, ROOT, Figure, Results, Spread, git
 from bench.scenario import PAGE, Scenario
 
 DOCUMENTS = ("docs/benchmarks.md", "README.md")
@@ -111,7 +111,7 @@ def tables(results: Results) -> Iterator[str]:
 
 def summary(results: Results) -> Iterator[str]:
     """The medians of both scenarios in one table."""
-    figures = (P50, CPU, MEMORY, BYTES)
+    figures = (P50, CPU, MEMORY)
     scenarios = page_scenarios(results)
     rows = [
         [
@@ -124,11 +124,9 @@ def summary(results: Results) -> Iterator[str]:
         ]
         for name in results.subjects
     ]
-    short = [
-        f"{one.robot} {one.rate_hz:g} Hz: {what}" for one in scenarios for what in ("us", "CPU %", "MB", "B")
-    ]
+    short = [f"{one.robot} {one.rate_hz:g} Hz: {what}" for one in scenarios for what in ("us", "CPU %", "MB")]
     yield from table(["", *short], rows)
-    yield "Medians: latency from stamp to pose, CPU and memory of all processes, bytes a sample on the wire."
+    yield "Medians: latency from stamp to pose, CPU and memory of all processes."
     yield f"{origin(results)}, {rounds(scenarios[0])}."
     for scenario in scenarios:
         yield from ("", better_in_short(results, scenario))

@@ -36,7 +36,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from operator import gt
 from typing import NamedTuple
 
 import numpy as np
@@ -1130,7 +1129,7 @@ def _shock(before: Vibration, sample: Inertia) -> Floats | None:
 
 def _jumps(change: Floats) -> bool:
     """Whether any number of a sample has changed as in a shock. In Python, a third of the time of arrays."""
-    return any(map(gt, map(abs, change.tolist()), _SHOCK))
+    return any(abs(one) > bound for one, bound in zip(change.tolist(), _SHOCK.tolist(), strict=True))
 
 
 def _without_shock(before: Estimate, sample: Inertia) -> Inertia:
