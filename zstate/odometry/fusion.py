@@ -1129,7 +1129,7 @@ def _shock(before: Vibration, sample: Inertia) -> Floats | None:
 
 def _jumps(change: Floats) -> bool:
     """Whether any number of a sample has changed as in a shock. In Python, a third of the time of arrays."""
-    return any(abs(one) > bound for one, bound in zip(change.tolist(), _SHOCK.tolist(), strict=True))
+    return any(abs(one) > bound for one, bound in zip(change.tolist(), _SHOCK, strict=True))
 
 
 def _without_shock(before: Estimate, sample: Inertia) -> Inertia:
