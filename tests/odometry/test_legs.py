@@ -221,14 +221,15 @@ class Walk:
 
 
 @pytest.mark.long
-def test_errors_of_walks_are_as_large_as_the_covariance_states():
+@pytest.mark.parametrize("walks", [10, pytest.param(20, marks=pytest.mark.soak)])
+def test_errors_of_walks_are_as_large_as_the_covariance_states(walks: int):
     nees = []
-    for seed in range(20):
+    for seed in range(walks):
         walk = Walk(seed)
         state = walk.estimate(200)
         assert set(state.feet) <= set(SLIDING_LEGS.names)
         nees.append(walk.body.nees(state))
-    low, high = mean_band(runs=20, freedom=3)
+    low, high = mean_band(runs=walks, freedom=3)
     mean = np.mean(nees, axis=0)
     assert ((low < mean) & (mean < high)).all(), mean
 

@@ -19,8 +19,8 @@ from helpers.recordings import HUSKY_REST_S, WHEELS, Recording, Score, Track, ca
 from zstate import Transform
 
 THREE_SIGMA = 3.5
-PART_S = 80.0
-"""A fifth of the Husky's recording, from its start in motion."""
+PART_S = 60.0
+"""A seventh of the Husky's recording, from its start in motion."""
 REST_PART_S = HUSKY_REST_S + PART_S
 NO_WORSE = 1.1
 """A drive with GPS errors of 0.8 to 1.7 m tells errors of 3 m apart by no more than a tenth."""
@@ -91,10 +91,8 @@ def test_wheels_and_gyro_alone_are_three_metres_off_after_359_metres():
 @pytest.mark.parametrize(
     ("as_joints", "has_compass", "start", "end"),
     [
-        pytest.param(False, True, HUSKY_REST_S, REST_PART_S, id="velocity-bad compass-at rest, in part"),
         pytest.param(False, False, 0.0, PART_S, id="velocity-no compass-in motion, in part"),
-        pytest.param(True, True, 0.0, PART_S, id="joints-bad compass-in motion, in part"),
-        pytest.param(True, False, HUSKY_REST_S, REST_PART_S, id="joints-no compass-at rest, in part"),
+        pytest.param(True, True, HUSKY_REST_S, REST_PART_S, id="joints-bad compass-at rest, in part"),
         *(
             pytest.param(as_joints, has_compass, start, math.inf, marks=pytest.mark.soak)
             for as_joints in (False, True)
@@ -188,7 +186,7 @@ def test_a_mount_that_is_wrong_by_five_degrees_costs_little_and_is_named(start: 
 @pytest.mark.parametrize("kind", ["velocity", "imu"])
 @pytest.mark.parametrize(
     ("begin", "end"),
-    [(30.0, PART_S), pytest.param(150.0, math.inf, id="whole", marks=pytest.mark.soak)],
+    [(20.0, PART_S), pytest.param(150.0, math.inf, id="whole", marks=pytest.mark.soak)],
 )
 def test_thirty_seconds_without_a_source_are_inside_the_claim(kind: str, begin: float, end: float):
     found, track = changed_score(without(kind, begin, 30.0, end))
@@ -227,7 +225,7 @@ def test_late_and_shuffled_data_of_a_recording_change_nothing():
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("as_joints", "has_compass", "imu_step"),
+    ("as_joints", "has_compass", "step"),
     [
         pytest.param(False, True, 3, id="velocity-true compass-17 Hz"),
         pytest.param(True, False, 3, id="joints-no compass-17 Hz"),
@@ -238,11 +236,9 @@ def test_late_and_shuffled_data_of_a_recording_change_nothing():
         ),
     ],
 )
-def test_a_jackal_that_turns_before_it_drives_keeps_its_yaw(
-    as_joints: bool, has_compass: bool, imu_step: int
-):
-    """The raw gyro drifts 1.5 degrees in this minute. Its IMU is read at 17 Hz, for speed, or at 50 Hz."""
-    calls = calls_of(jackal(), as_joints=as_joints, has_compass=has_compass, imu_step=imu_step)
+def test_a_jackal_that_turns_before_it_drives_keeps_its_yaw(as_joints: bool, has_compass: bool, step: int):
+    """The raw gyro drifts 1.5 degrees in this minute. Sensors are read at 17 or 50 Hz."""
+    calls = calls_of(jackal(), as_joints=as_joints, has_compass=has_compass, imu_step=step, wheel_step=step)
     track = played(jackal(), calls, wheels=WHEELS if as_joints else None)
     truth = np.unwrap(jackal().compass[:, 1])
     at = np.interp(track.t, jackal().compass[:, 0], truth)

@@ -344,9 +344,9 @@ def scored(sources: str, start: float, end: float = math.inf) -> Score:
 
 @pytest.mark.long
 def test_a_real_drivers_odometry_is_inside_its_claim_and_beside_wheels_makes_a_drive_no_worse():
-    """From rest, for 80 s. The errors of the fixes are 0.8 to 1.7 m."""
+    """From rest, for 60 s. The errors of the fixes are 0.8 to 1.7 m."""
     driver, wheels, both = (
-        scored(sources, HUSKY_REST_S, HUSKY_REST_S + 80.0)
+        scored(sources, HUSKY_REST_S, HUSKY_REST_S + 60.0)
         for sources in ("driver", "wheels", "wheels, driver")
     )
     assert driver.error < 4.0

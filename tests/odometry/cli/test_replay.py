@@ -54,7 +54,7 @@ SETTINGS = OdometrySettings(
     imu_noise=NOISE,
     diff_drive=DiffDrive("left_wheel_joint", "right_wheel_joint", radius=0.08, track=0.32),
 )
-SECONDS = 10
+SECONDS = 8
 FLOW_SIGMA, MOCAP_SIGMA = 0.04, 0.02
 FLOW_DELAY_MS, JOINT_DELAY_MS = 60, 0
 MAP_FROM_ODOM = 3.0, -2.0, 2.0
