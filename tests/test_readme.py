@@ -158,6 +158,6 @@ def test_links_lead_to_files_of_a_clone(page: Path) -> None:
 
 def test_every_command_named_exists() -> None:
     pages = "".join(path.read_text() for path in DOCS.rglob("*.md"))
-    named = set(re.findall(r"`zstate ([a-z]\w*)", README + pages)) - {"upower"}  # of another package
+    named = set(re.findall(r"`zstate ([a-z]\w*)", README + pages))
     known = set(re.findall(r"^  (\w+) ", run_cli("--help").stdout, re.MULTILINE))
     assert named <= known, named - known

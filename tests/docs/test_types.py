@@ -65,7 +65,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project that has all programs."""
     project = tmp_path_factory.mktemp("programs")
     names = {path.name for path in write_programs(project)}
-    assert {"guides_lookup_poses.py", "readme_publish.py", "tutorial_swing.py"} <= names
+    assert {"guides_lookup_poses.py", "readme_pose.py", "tutorial_swing.py"} <= names
     (project / "claims.py").write_text(CLAIMS)
     write_stubs(project / "typings")
     return project
