@@ -11,6 +11,7 @@ import signal
 import subprocess
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -163,9 +164,18 @@ class Roscore:
             return False
 
     def close(self) -> None:
-        """Sends SIGINT: it then ends its own children, which a kill would leave behind."""
-        self._process.send_signal(signal.SIGINT)
-        self._process.wait(15)
+        """Sends SIGINT, again if it is lost while roscore starts.
+
+        It then ends its own children, which a kill would leave behind.
+        """
+
+        def has_ended() -> bool:
+            self._process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(5)
+            return self._process.returncode is not None
+
+        until(has_ended)
 
 
 def ros_environment(home: Path) -> dict[str, str]:
