@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -35,11 +36,13 @@ def test_documents_show_the_figures_of_the_results_that_they_name() -> None:
 
 
 def test_figures_are_not_older_than_what_they_measure() -> None:
+    """A checkout without history cannot know, and says so; the workflows fetch all of it."""
     try:
         reason = why_stale(shown_results())
     except CannotKnow as unknown:
-        pytest.skip(f"the age of the figures cannot be known: {unknown}")
-    assert reason is None, reason
+        warnings.warn(f"the age of the figures cannot be known: {unknown}", stacklevel=1)
+    else:
+        assert reason is None, reason
 
 
 def test_repository_has_the_results_of_the_shown_run_only() -> None:
