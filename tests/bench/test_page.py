@@ -90,6 +90,13 @@ def test_age_is_unknown_in_a_shallow_clone_and_without_git(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     results = write_results(tmp_path, FACTORS)
+
+    def unknown_commit(command: str, *arguments: str) -> str:
+        if command == "rev-list":
+            raise subprocess.CalledProcessError(128, command)
+        return {"rev-parse": "false", "log": ""}[command]
+
+    monkeypatch.setattr(page, "git", unknown_commit)
     with pytest.raises(CannotKnow, match="does not know the commit abc1234"):
         why_stale(results)
     fake_git({"rev-parse": "true"}, monkeypatch)
