@@ -234,6 +234,8 @@ def test_invalid_configuration_is_named(tmp_path):
         connect({"bogus": 1})
     with pytest.raises(ConfigError, match="missing"):
         connect(tmp_path / "missing.json5")
+    with pytest.raises(ConfigError, match=r"is an endpoint, not a file: connect\(mode='client', endpoints="):
+        connect("tcp/127.0.0.1:7447")
     latin = tmp_path / "latin.json5"
     latin.write_bytes(b"{mode: 'p\xe9er'}")
     with pytest.raises(ConfigError) as caught:

@@ -195,6 +195,8 @@ def _load(source: ConfigSource) -> zenoh.Config:
         return _parse(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         text = f"the Zenoh configuration {str(path)!r} cannot be read: {error}"
+        if str(path).partition("/")[0] in _ADDRESSED | _LOCAL:
+            text = f"{str(path)!r} is an endpoint, not a file: connect(mode='client', endpoints={str(path)!r})"
         raise ConfigError(text, path=str(path)) from None
 
 
