@@ -66,3 +66,13 @@ def test_descriptions_of_the_last_four_sessions_are_kept():
     for session in (1, 2, 3, 4, 1, 5):
         descriptions.add(description(session, "system"))
     assert [session for session in range(6) if descriptions.of(session)] == [1, 3, 4, 5]
+
+
+def test_robots_of_one_model_keep_its_text_once():
+    kept = []
+    for session in (1, 2):  # each of a robot of its own, with a text of its own
+        descriptions = SessionDescriptions()
+        descriptions.add(RobotDescription(session, "".join(["<robot", "/>"]), "digest", (), ()))
+        kept.append(descriptions.of(session))
+    assert kept[0].urdf is kept[1].urdf
+    assert [one.session for one in kept] == [1, 2]

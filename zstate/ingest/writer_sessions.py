@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from zstate._util.bounded import BoundedDict
 from zstate.clock import Clock
-from zstate.wire.messages import RobotDescription
+from zstate.wire.messages import Edges, RobotDescription
 
 SILENT_NS = 2_000_000_000
 """A writer without a token that has sent nothing for this long no longer replaces an announced one."""
@@ -70,6 +72,14 @@ class WriterSessions:
         self._silence = None, 0
 
 
+@lru_cache(maxsize=16)
+def _shared(
+    urdf: str, digest: str, joint_names: tuple[str, ...], moving_edges: Edges
+) -> tuple[str, str, tuple[str, ...], Edges]:
+    """The same; the robots of a fleet have the same model, and keep it once."""
+    return urdf, digest, joint_names, moving_edges
+
+
 class SessionDescriptions:
     """The last descriptions of a robot, and the clock domains in them, by session."""
 
@@ -83,7 +93,9 @@ class SessionDescriptions:
         session = description.session
         self._last_domain = self._domains[session] = description.clock
         self._descriptions.pop(session, None)
-        self._descriptions[session] = description
+        one = description
+        model = _shared(one.urdf, one.digest, one.joint_names, one.moving_edges)
+        self._descriptions[session] = RobotDescription(session, *model, one.clock)
         if len(self._descriptions) > _MAX_DESCRIPTIONS:
             del self._descriptions[next(iter(self._descriptions))]
 

@@ -191,12 +191,13 @@ def _load(source: ConfigSource) -> zenoh.Config:
     if isinstance(source, Mapping):
         return _parse(json.dumps(dict(source)), "the configuration given")
     path = Path(source)
+    if (text := str(path)).partition("/")[0] in _ADDRESSED | _LOCAL and not path.exists():
+        error = f"{text!r} is an endpoint, not a file: connect(mode='client', endpoints={text!r})"
+        raise ConfigError(error, path=text)
     try:
         return _parse(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         text = f"the Zenoh configuration {str(path)!r} cannot be read: {error}"
-        if str(path).partition("/")[0] in _ADDRESSED | _LOCAL:
-            text = f"{str(path)!r} is an endpoint, not a file: connect(mode='client', endpoints={str(path)!r})"
         raise ConfigError(text, path=str(path)) from None
 
 
