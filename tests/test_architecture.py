@@ -54,7 +54,7 @@ NEIGHBOURS = {
 }
 
 # The modules of the buffer that other packages may import.
-BUFFER_MODULES = {"buffer", "edge_rules", "frame_tree", "snapshot", "tracks"}
+BUFFER_MODULES = {"buffer", "edge_rules", "feed", "frame_tree", "snapshot", "tracks"}
 
 HOMES = {
     "pinocchio": "model",
@@ -249,7 +249,7 @@ def impurities(source: Source) -> Iterator[str]:
 
 
 def buffer_internals(source: Source) -> Iterator[str]:
-    """Histories, paths and interpolators are private to the buffer; other packages use its methods."""
+    """Histories, paths and interpolators are private to the buffer; others use its methods and its feed."""
     for top, *rest in source.imports():
         is_outside = top == "zstate" and rest[:1] == ["buffer"] and source.room != "buffer"
         if is_outside and rest[1] not in BUFFER_MODULES:

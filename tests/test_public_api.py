@@ -79,12 +79,15 @@ SIGNATURES = {
     "Transform.from_rpy": "(target, source, translation, rpy, stamp=None)",
     "TransformBuffer": "(history_s=10.0, clock=None)",
     "TransformBuffer.add_robot": "(model, prefix='')",
+    "TransformBuffer.remove_robot": "(track)",
     "TransformBuffer.insert_joints": "(track, stamp, positions, velocities=None)",
     "TransformBuffer.insert": "(transform, *, writer=None)",
     "TransformBuffer.insert_many": "(edges, stamp, poses, *, covariances=None, writer=None)",
     "TransformBuffer.insert_static": "(transform, *, writer=None)",
     "TransformBuffer.withdraw": "(child)",
     "TransformBuffer.clear": "()",
+    "TransformBuffer.keep_only_around": "(stamps)",
+    "TransformBuffer.stop": "(reason)",
     "TransformBuffer.lookup": ("(target, source, at=None, *, timeout_s=0.0, max_age_s=None, predict_s=0.0)"),
     "TransformBuffer.lookup_between": "(target, target_at, source, source_at, fixed)",
     "TransformBuffer.lookup_many": "(target, source, stamps)",
@@ -96,7 +99,16 @@ SIGNATURES = {
     "TransformBuffer.latest": "(target, source)",
     "TransformBuffer.wait": "(target, source, at=None, timeout_s=1.0)",
     "TransformBuffer.wait_async": "(target, source, at=None, timeout_s=1.0)",
+    "TransformBuffer.watch": "(target, source, callback, *, translation_m=None, rotation_rad=None)",
+    "TransformBuffer.join": (
+        "(samples, target, *, frame=operator.attrgetter('frame'), stamp=operator.attrgetter('stamp'), "
+        "timeout_s=1.0)"
+    ),
     "TransformBuffer.frames": "(among=None)",
+    "TransformBuffer.path_frames": "(target, source)",
+    "TransformBuffer.frame_table": "(robots=())",
+    "TransformBuffer.snapshot": "(at=None, *, robots=(), hold_s=0.0)",
+    "TransformBuffer.span": "()",
     "TransformBuffer.joint_positions": "(robot, at=None)",
     "TransformBuffer.joint_positions_many": "(robot, stamps)",
     "TransformBuffer.joint_states": "(robot, start=None, end=None)",
@@ -178,6 +190,12 @@ def test_every_name_is_listed_and_has_a_docstring():
 
 def test_signatures_are_the_contract():
     assert {path: signature_of(path) for path in SIGNATURES} == SIGNATURES
+
+
+def test_a_buffer_has_what_a_program_may_call_and_nothing_else():
+    public = {name for name in dir(zstate.TransformBuffer()) if not name.startswith("_")}
+    methods = {path.partition(".")[2] for path in SIGNATURES if path.startswith("TransformBuffer.")}
+    assert public == methods | {"clock", "history_s", "ignored"}
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from helpers.buffers import MS, NOW, moving
 from helpers.processes import DEADLINE_S
 from numpy.typing import ArrayLike
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed, Stale
 from zstate.model.load import load_model
@@ -47,15 +47,15 @@ class World:
     def __init__(self) -> None:
         self.buffer = TransformBuffer()
         self.robot = self.buffer.add_robot(load_model(CRANE))
-        self.lift = self.buffer.add_part(self.robot, ["lift"])
-        self.buffer.assign_joints(self.robot, {"lift": self.lift})
+        self.lift = feed_of(self.buffer).add_part(self.robot, ["lift"])
+        feed_of(self.buffer).assign_joints(self.robot, {"lift": self.lift})
         for writer in (self.write_base, self.write_joints):
             writer(0)
 
     def write_base(self, epoch: int) -> None:
-        edge = self.buffer.tree_snapshot().edges.get("base")
+        edge = feed_of(self.buffer).tree_snapshot().edges.get("base")
         if edge is not None and edge.track is not None:
-            self.buffer.restart(edge.track)
+            feed_of(self.buffer).restart(edge.track)
         pose, triangle = [[epoch, 0, 0, 0, 0, 0, 1]], np.zeros((1, 21))
         triangle[0, 0] = epoch
         for stamp in stamps_of(epoch):
@@ -66,7 +66,7 @@ class World:
         self.write_driver(self.lift, [epoch], epoch)
 
     def write_driver(self, track: JointTrack, positions: list[float], epoch: int) -> None:
-        self.buffer.restart(track)
+        feed_of(self.buffer).restart(track)
         for stamp in stamps_of(epoch):
             self.buffer.insert_joints(track, stamp, positions)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.robots import RRBOT, SECOND
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.errors import InvalidInput, NoData
 from zstate.model.load import load_model
 
@@ -124,10 +124,10 @@ def test_joint_positions_follow_changes_of_drivers_and_of_columns():
     buffer.insert_joints(track, 2 * SECOND, [4.0, 0.0], [2.0, 0.0])
     assert buffer.joint_positions("r1", SECOND * 3 // 2)[0].tolist() == [2.5, 0.0]
     elbow = RRBOT.joint_names[1]
-    part = buffer.add_part(track, [elbow])
+    part = feed_of(buffer).add_part(track, [elbow])
     buffer.insert_joints(part, 0, [0.25])
     buffer.insert_joints(part, SECOND, [0.75])
-    buffer.assign_joints(track, {elbow: part})
+    feed_of(buffer).assign_joints(track, {elbow: part})
     assert buffer.joint_positions("r1", SECOND // 2)[0].tolist() == [0.5, 0.5]
-    buffer.assign_joints(track, {})
+    feed_of(buffer).assign_joints(track, {})
     assert buffer.joint_positions("r1", SECOND // 2)[0].tolist() == [0.5, 0.0]

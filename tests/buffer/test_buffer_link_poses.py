@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from zstate import InFuture, InPast, Kinematics, NoData, Stale, Transform, TransformBuffer, load_model
+from zstate.buffer.buffer import feed_of
 from zstate.buffer.tracks import JointTrack, PoseTrack
 from zstate.errors import InsertRefused
 
@@ -82,7 +83,7 @@ def calls_on(buffer: TransformBuffer, track: JointTrack) -> dict[str, Callable[[
         "insert_joints of a list": lambda: buffer.insert_joints(track, 5, [0.0, 0.0]),
         "insert_joints of a block": lambda: buffer.insert_joints(track, 5, zeros.tobytes()),
         "insert_joints with velocities": lambda: buffer.insert_joints(track, 5, zeros, zeros),
-        "restart": lambda: buffer.restart(track),
+        "restart": lambda: feed_of(buffer).restart(track),
         "remove_robot": lambda: buffer.remove_robot(track),
     }
 
@@ -113,4 +114,4 @@ def test_track_of_another_buffer_is_refused_and_unchanged() -> None:
     assert theirs.lookup("world", "tool").stamp == 3
     poses = PoseTrack((("a", "b"),), 10, None)
     with pytest.raises(InsertRefused, match="'a -> b' belongs to another buffer"):
-        ours.restart(poses)
+        feed_of(ours).restart(poses)

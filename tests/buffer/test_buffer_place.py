@@ -47,7 +47,7 @@ def assert_placed_as_looked_up(
     """By both kernels, to 1e-12 of the numbers involved. Which points have a pose."""
     expected, known = looked_up(buffer, points, stamps, source, target)
     scale = max(1.0, np.abs(points).max(initial=0.0), np.nanmax(np.abs(expected), initial=0.0))
-    reference = buffer.path(target, source, compiled=False).place(points, stamps)
+    reference = buffer._path(target, source, compiled=False).place(points, stamps)
     for placed, valid in (buffer.place(points, stamps, source, target), reference):
         assert valid.tolist() == known.tolist()
         np.testing.assert_allclose(placed, expected, rtol=0.0, atol=1e-12 * scale)
@@ -363,7 +363,7 @@ def test_rows_without_a_point_are_nan_and_change_no_other_row(order: str, dtype:
     holed = points.copy()
     holed[::7, 1], holed[3::7, 0], holed[5::7] = np.nan, np.inf, -np.inf
     is_point = np.isfinite(holed).all(axis=1)
-    path = buffer.path("odom", "laser", compiled=False)
+    path = buffer._path("odom", "laser", compiled=False)
     for place in (lambda p: buffer.place(p, stamps, "laser", "odom"), lambda p: path.place(p, stamps)):
         whole, all_valid = place(points)
         placed, valid = place(holed)

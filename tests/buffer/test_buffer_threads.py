@@ -18,7 +18,7 @@ import pytest
 from helpers.buffers import NOW, S, every_joint, moving, pose_of_every, static
 from helpers.processes import DEADLINE_S, until
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.errors import Disconnected, InFuture, InPast, LookupFailed, NoData, Stale
 from zstate.transform import Transform
 
@@ -68,7 +68,7 @@ def write_churn(buffer: TransformBuffer, track, tick: int) -> None:
     if tick % 500 == 499:
         buffer.clear()
     if tick % 700 == 699:
-        buffer.restart(track)
+        feed_of(buffer).restart(track)
 
 
 def check(answer: Transform, expected: float) -> None:

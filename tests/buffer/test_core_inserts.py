@@ -21,7 +21,7 @@ from helpers.buffers import (
     x_of,
 )
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.errors import InFuture, InPast, InsertRefused, InvalidInput, NoData, UnknownFrame
 from zstate.model.load import load_model
 from zstate.transform import Transform
@@ -95,7 +95,7 @@ def test_restart_clears_one_track_and_no_other() -> None:
     buffer, track = every_joint()
     buffer.insert_joints(track, 100 * S, pose_of_every(track, bend=1.0))
     buffer.insert(moving("map", "root", 100 * S, x=1.0))
-    buffer.restart(track)
+    feed_of(buffer).restart(track)
     assert isinstance(failure(buffer, "body", "arm"), NoData)
     assert x_of(buffer.lookup("map", "root", 100 * S)) == 1.0
     assert buffer.insert_joints(track, S, pose_of_every(track))

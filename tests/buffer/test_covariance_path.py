@@ -137,7 +137,7 @@ def test_poses_and_placed_points_are_the_same_with_covariances(compiled: bool):
             plain.insert(moved)
             uncertain.insert(moved.with_covariance(random_covariance(random, 0.1)))
     stamps, points = np.arange(0, 2 * S, S // 7), random.normal(size=(15, 3))
-    paths = [buffer.path("mast", "odom", compiled=compiled) for buffer in (plain, uncertain)]
+    paths = [buffer._path("mast", "odom", compiled=compiled) for buffer in (plain, uncertain)]
     for at in (*stamps.tolist(), None):
         transforms = [path.transform(at) for path in paths]
         assert transforms[0].pose7.tolist() == transforms[1].pose7.tolist()

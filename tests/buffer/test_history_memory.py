@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.buffers import MS, NOW, S, moving
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.tracks import JointTrack
 from zstate.model.load import load_model
 
@@ -105,7 +105,7 @@ def test_late_samples_need_no_more_memory_than_ordered_ones(late: int) -> None:
     for n in range(3_000):
         # Every second sample comes before its neighbour when ``late``.
         buffer.insert(moving("a", "b", (n ^ late) * MS))
-    view = buffer.tree_snapshot().edges["b"].track.history.view
+    view = feed_of(buffer).tree_snapshot().edges["b"].track.history.view
     assert view.size == 1_001
     assert len(view.stamps) <= 2 * view.size
 
@@ -117,6 +117,6 @@ def test_only_the_ends_and_the_samples_around_the_requested_stamps_are_kept() ->
     wanted = np.array([10 * S + 1, 20 * S, 99 * S])
     before, _ = buffer.lookup_many("odom", "base", wanted)
     buffer.keep_only_around(wanted)
-    kept = buffer.tree_snapshot().edges["base"].track.history.view.kept_stamps()
+    kept = feed_of(buffer).tree_snapshot().edges["base"].track.history.view.kept_stamps()
     assert kept.tolist() == [0, 10 * S, 11 * S, 20 * S, 99 * S]
     assert np.array_equal(buffer.lookup_many("odom", "base", wanted)[0], before)

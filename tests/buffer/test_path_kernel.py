@@ -72,7 +72,7 @@ def test_search_is_correct_for_any_spacing_of_stamps(column: list[int], asked: l
 
 def both_paths(buffer: TransformBuffer, target: str, source: str) -> tuple[TransformPath, TransformPath]:
     """The same path with the extension and without."""
-    path, reference = buffer.path(target, source), buffer.path(target, source, compiled=False)
+    path, reference = buffer._path(target, source), buffer._path(target, source, compiled=False)
     assert isinstance(path, CompiledPath)
     assert type(reference) is TransformPath
     return path, reference

@@ -15,7 +15,7 @@ from types import FrameType
 import pytest
 from helpers.buffers import MS, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.frame_tree import FrameTree
 from zstate.buffer.path import compile_path
 from zstate.buffer.tracks import JointTrack
@@ -208,7 +208,9 @@ def test_watch_continues_when_an_edge_returns_with_another_history() -> None:
     assert [x_of(transform) for transform in seen] == [1.0, 2.0]
 
 
-@pytest.mark.parametrize("forget", [TransformBuffer.restart, lambda buffer, _: buffer.clear()])
+@pytest.mark.parametrize(
+    "forget", [lambda buffer, track: feed_of(buffer).restart(track), lambda buffer, _: buffer.clear()]
+)
 def test_watch_continues_in_a_new_epoch_with_older_stamps(forget) -> None:
     buffer = TransformBuffer()
     (track,) = fleet(buffer, 1)

@@ -23,6 +23,7 @@ from helpers.cli_runner import (
 from helpers.processes import repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
+from zstate.buffer.buffer import feed_of
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.clock import ManualClock
 from zstate.nodes.clock import ClockPublisher
@@ -68,7 +69,7 @@ def test_publish_uses_the_simulated_time_for_stamps_and_rate():
         until(lambda: [frame.count for frame in joint_frames()] == [250, 250])
         frame = joint_frames()[0]
         assert frame.newest - frame.oldest == 249 * 20 * MS
-        assert listener.buffer.domain.domain_of("rrbot") == "sim"
+        assert feed_of(listener.buffer).domain.domain_of("rrbot") == "sim"
         assert listener.stats.off_clock == 0
 
 

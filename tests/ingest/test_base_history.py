@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.robots import RRBOT, STAMP, assert_pose
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.history import History, HistoryView
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
@@ -229,7 +229,7 @@ class MovingHistory:
             self.ingest.insert_history(samples[start : start + page])
 
     def view(self, child: str) -> HistoryView:
-        edge = self.buffer.edge_of(child)
+        edge = feed_of(self.buffer).edge_of(child)
         assert edge is not None
         assert edge.track is not None
         return edge.track.history.view

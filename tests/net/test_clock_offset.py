@@ -9,6 +9,7 @@ import zenoh
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
+from zstate.buffer.buffer import feed_of
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
 from zstate.net.clock_offset import ClockOffsetMonitor, measure_offsets, unanswered
@@ -142,7 +143,7 @@ def test_failed_lookup_mentions_a_wrong_writer_clock(sessions):
             assert abs(reason.clock_offset_ns - 1_200 * MS) <= reason.clock_uncertainty_ns
             assert "the clock of 'driver@" in str(reason)
             assert "' is 1.2 s ahead of this one (± " in str(reason)
-        listener.buffer.clock = ManualClock(stamp + 60 * SECOND)
+        feed_of(listener.buffer).use_clock(ManualClock(stamp + 60 * SECOND))
         with pytest.raises(
             Stale, match=r"alive \(`zstate ls`\)\? the clock of 'driver@\S+ pid \d+' is 1\.2 s"
         ):

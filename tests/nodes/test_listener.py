@@ -11,7 +11,7 @@ import pytest
 from helpers.processes import DEADLINE_S, Child, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, wait_for_stream_readers
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import ManualClock
 from zstate.errors import AmbiguousFrame, InvalidInput, UnknownFrame
 from zstate.model.load import load_model
@@ -45,7 +45,7 @@ def test_both_follow_modes_agree_with_kinematics_at_every_stamp(sessions, model)
         wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         for listener in (joints, transforms):
             # Who does not know yet whose time these are counts none as off the clock.
-            until(lambda listener=listener: listener.buffer.domain.domain_of("r1") == "system")
+            until(lambda listener=listener: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         for stamp in stamps:
             publisher.publish(sine.read(stamp).positions, stamp=stamp)
         for listener in (joints, transforms):

@@ -19,7 +19,7 @@ import pytest
 from helpers.processes import until
 from helpers.robots import RRBOT, SECOND, UPRIGHT, wait_for_reader, wait_for_stream_readers
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import SIMULATED, ManualClock
 from zstate.extension import kernel
 from zstate.ingest.base import StreamIngest
@@ -366,7 +366,7 @@ def test_nearly_all_samples_of_a_publisher_take_one_call(sessions, robot):
         listener.buffer.watch("r1/base", "r1/tool", lambda transform: seen.append(transform.stamp))
         listener.add_observer(lambda: batches.append(listener.stats.received))
         wait_for_stream_readers(writer, "r1")
-        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         stamps = list[int]()
         for number in range(50):
             stamps.append(time.time_ns())
@@ -385,7 +385,7 @@ def test_samples_with_velocities_take_one_call(sessions):
         TransformListener(reader, "r1", history_on_join=False) as listener,
     ):
         wait_for_stream_readers(writer, "r1")
-        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         for number in range(20):
             publisher.publish([0.0, 0.0], [0.5 * number, -1.0])
             until(lambda number=number: listener.stats.received == number + 1)
@@ -448,7 +448,7 @@ def test_buffer_with_an_insert_of_its_own_gets_every_sample(sessions):
         TransformListener(reader, "r1", buffer, history_on_join=False) as listener,
     ):
         wait_for_stream_readers(writer, "r1")
-        until(lambda: buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(buffer).domain.domain_of("r1") == "system")
         for number in range(20):
             publisher.publish([0.0, 0.0])
             until(lambda number=number: listener.stats.received == number + 1)

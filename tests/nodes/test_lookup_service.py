@@ -10,7 +10,7 @@ from helpers.lookup_client import query_lookup
 from helpers.processes import Child, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.errors import Disconnected, InFuture, InPast, NoData, UnknownFrame, Unreachable
 from zstate.net.session import Session, connect
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
@@ -50,8 +50,8 @@ def two_robots() -> TransformBuffer:
     buffer = TransformBuffer()
     for robot, height in (("r1", 1.0), ("r2", 2.0)):
         buffer.insert_static(Transform(f"{robot}/base", f"{robot}/tool", (0.0, 0.0, height), UPRIGHT))
-    buffer.name_robot("r1")
-    buffer.name_robot("r2")
+    feed_of(buffer).name_robot("r1")
+    feed_of(buffer).name_robot("r2")
     return buffer
 
 

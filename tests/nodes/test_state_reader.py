@@ -6,7 +6,7 @@ import pytest
 from helpers.processes import until
 from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.ingest.counters import Counters
 from zstate.net.service_thread import ServiceThread
 from zstate.nodes.listener import TransformListener
@@ -38,7 +38,7 @@ def test_reader_without_diagnostics_inserts_what_a_listener_inserts(sessions, fo
         ) as alone,
     ):
         wait_for_stream_readers(writer, "r1", follow)
-        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         for step in range(20):
             publisher.publish([0.01 * step, -0.02 * step], stamp=STAMP + step * MS)
         for count in (counters.stats, lambda: listener.stats):

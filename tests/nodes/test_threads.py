@@ -12,6 +12,7 @@ import pytest
 from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
+from zstate.buffer.buffer import feed_of
 from zstate.ingest.robot_ingests import RobotIngests
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
@@ -68,7 +69,7 @@ def test_a_listener_has_three_threads_and_one_for_each_other_stream_that_it_rece
             wait_for_stream_readers(writer, "r1", follow)
             publisher.publish([0.0, 0.0], stamp=STAMP)
             until(lambda: listener.buffer.can_lookup("world", "tool", STAMP))
-            (offset,) = listener.buffer.clock_offsets.values()
+            (offset,) = feed_of(listener.buffer).clock_offsets.values()
             until(offset)
             assert of_listener(threads) == LISTENER
             still = Transform("odom", "world", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -128,7 +129,7 @@ def test_a_slow_model_of_one_robot_delays_no_sample_of_another(
         OdometryPublisher(writer, "r1") as odometry,
     ):
         wait_for_stream_readers(writer, "r1")
-        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         with StatePublisher(writer, RRBOT, "r2"):
             assert is_loading.wait(DEADLINE_S)
             publisher.publish([0.0, 0.0], stamp=STAMP)

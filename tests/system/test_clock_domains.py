@@ -12,7 +12,7 @@ from helpers.processes import until
 from helpers.recording_builder import START, RecordingBuilder
 from helpers.robots import RRBOT, wait_for_reader, wait_for_stream_readers
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import ManualClock, SystemClock
 from zstate.errors import ClockMismatch, InvalidInput
 from zstate.ingest.counters import Counters
@@ -67,7 +67,8 @@ def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_them_raises_clock
         for robot in ("r1", "r2"):
             cell.set(Transform("cell/map", f"{robot}/world", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
             wait_for_stream_readers(writer, robot, follow)
-        until(lambda: (buffer.domain.domain_of("r1"), buffer.domain.domain_of("r2")) == ("system", "sim"))
+        domain_of = feed_of(buffer).domain.domain_of
+        until(lambda: (domain_of("r1"), domain_of("r2")) == ("system", "sim"))
         for robot in (virtual, real):
             robot.publish([0.5, 0.5])
         assert buffer.wait("map", "r1/tool", timeout_s=5.0).stamp == NOW
@@ -87,7 +88,7 @@ def two_clocks() -> TransformBuffer:
     buffer = TransformBuffer()
     for robot, domain, stamp in (("r1", "system", NOW), ("r2", "sim", 5 * SECOND)):
         track = buffer.add_robot(RRBOT, robot)
-        buffer.set_domain(robot, domain)
+        feed_of(buffer).set_domain(robot, domain)
         for number in range(2):
             buffer.insert_joints(track, stamp + number * MS, [0.5, 0.5])
     buffer.insert_static(Transform("r1/world", "r2/world", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
@@ -122,18 +123,18 @@ def test_every_lookup_across_two_clocks_is_refused(ask):
 def test_path_domain_is_that_of_its_moving_edges(given, expected):
     buffer = two_clocks()
     for robot in ("r2", "r1"):
-        buffer.domain.join(robot)
-    buffer.domain.given = given
+        feed_of(buffer).domain.join(robot)
+    feed_of(buffer).domain.given = given
     start = {"sim": 5 * SECOND, "system": NOW}[expected]
     assert buffer.span() == (start, start + MS)
 
 
 def test_cached_path_is_recompiled_after_a_domain_change():
     buffer = two_clocks()
-    buffer.set_domain("r2", "system")
+    feed_of(buffer).set_domain("r2", "system")
     buffer.lookup_many("r1/tool", "r2/tool", [NOW])
     plan = buffer.plan("r1/tool", "r2/tool")
-    buffer.set_domain("r2", "sim")
+    feed_of(buffer).set_domain("r2", "sim")
     with pytest.raises(ClockMismatch):
         buffer.lookup_many("r1/tool", "r2/tool", [NOW])
     with pytest.raises(ClockMismatch):
@@ -145,16 +146,16 @@ def test_wait_across_two_clocks_ends_when_one_robot_changes_its_clock():
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(buffer.wait, "r1/tool", "r2/tool", NOW, 10.0)
         until(lambda: len(buffer._waiters))
-        buffer.set_domain("r2", "system")
-        buffer.insert_joints(buffer.tree_snapshot().robots["r2"], NOW, [0.5, 0.5])
+        feed_of(buffer).set_domain("r2", "system")
+        buffer.insert_joints(feed_of(buffer).tree_snapshot().robots["r2"], NOW, [0.5, 0.5])
         assert waiting.result(10.0).stamp == NOW
 
 
 def test_edges_placed_in_frames_of_another_robot_keep_the_clock_of_their_writer():
     buffer = TransformBuffer()
-    buffer.set_domain("fleet", "sim")
-    buffer.set_domain("r1", "system")
-    buffer.domain.assign("fleet", ["r1/odom"])
+    feed_of(buffer).set_domain("fleet", "sim")
+    feed_of(buffer).set_domain("r1", "system")
+    feed_of(buffer).domain.assign("fleet", ["r1/odom"])
     turn = [0.0, 0.0, 0.0, 1.0]
     buffer.insert(Transform("fleet/map", "r1/odom", [0.0, 0.0, 0.0], turn, NOW))
     buffer.insert(Transform("r1/odom", "r1/base", [0.0, 0.0, 0.0], turn, NOW))
@@ -172,7 +173,7 @@ def test_default_domain_is_that_of_most_robots_with_samples(sessions):
             for name, clock in names.items()
         }
         listener = opened.enter_context(TransformListener(reader))
-        domain = listener.buffer.domain
+        domain = feed_of(listener.buffer).domain
         for name in names:
             wait_for_stream_readers(writer, name)
             until(lambda name=name: domain.domain_of(name) is not None)
@@ -199,7 +200,7 @@ def test_robot_may_change_its_clock(sessions):
         with StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual:
             wait_for_stream_readers(writer, "r1")
             virtual.publish([0.5, 0.5])
-            until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
+            until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "sim")
             until(lambda: listener.buffer.latest("world", "tool") == 5 * SECOND)
         assert listener.stats.refused == {}
 
@@ -214,13 +215,13 @@ def test_age_limit_of_another_clock_is_an_error_naming_both(sessions, follow):
         wait_for_stream_readers(writer, "r1", follow)
         virtual.publish([0.5, 0.5])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
-        until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "sim")
         for timeout_s in (0.0, 60.0):  # the given clock does not change, so waiting is no use
             with pytest.raises(ClockMismatch, match="max_age_s is measured by a clock of 'system'") as caught:
                 listener.buffer.lookup("world", "tool", max_age_s=1.0, timeout_s=timeout_s)
         assert (caught.value.domains, caught.value.robots) == (("sim", "system"), ("r1",))
         assert not isinstance(caught.value, TimeoutError)
-        listener.buffer.use_clock(simulated(6 * SECOND))
+        feed_of(listener.buffer).use_clock(simulated(6 * SECOND))
         assert listener.buffer.lookup("world", "tool", max_age_s=1.0).stamp == 5 * SECOND
 
 
@@ -278,7 +279,7 @@ def test_clock_an_hour_ahead_and_back_is_logged_and_followed_without_effect_on_o
         steady.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 1)
         publish(NOW)
-        until(lambda: buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(buffer).domain.domain_of("r1") == "system")
         buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
         publish(NOW + HOUR)
         publish(NOW + HOUR + MS)
@@ -409,7 +410,7 @@ def test_stamps_far_off_are_used_counted_and_logged_once_per_program(sessions, c
 
 def test_writer_restarting_with_each_sample_is_logged_once(caplog):
     buffer, counters = TransformBuffer(clock=ManualClock(NOW)), Counters()
-    buffer.set_domain("r1", "system")
+    feed_of(buffer).set_domain("r1", "system")
     off_clock = StampCheck(buffer, counters, is_described=True)
     with caplog.at_level(logging.WARNING, "zstate"):
         for session in range(100):
@@ -424,7 +425,7 @@ def test_stamp_check_threshold_is_one_minute(sessions):
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener,
     ):
-        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         wait_for_stream_readers(writer, "r1")
         for stamp in (NOW - 60 * SECOND, NOW + 60 * SECOND):
             publisher.publish([0.5, 0.5], stamp=stamp)
@@ -477,9 +478,9 @@ def test_replay_has_its_own_clock_domain(sessions, tmp_path):
         TransformListener(reader, "*", clock=SystemClock()) as listener,
         Player(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
     ):
-        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "system")
         replayer.run()
-        until(lambda: listener.buffer.domain.domain_of("arm") == "sim")
+        until(lambda: feed_of(listener.buffer).domain.domain_of("arm") == "sim")
         assert listener.buffer.can_lookup("arm/world", "arm/tool")
 
 

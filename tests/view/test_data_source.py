@@ -18,6 +18,7 @@ from zstate import (
     TransformPublisher,
     load_model,
 )
+from zstate.buffer.buffer import feed_of
 from zstate.recording.recorder import Recorder
 from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.view.data_source import FixedFrame, ViewSource
@@ -39,7 +40,7 @@ def source_of(*robots: str, shown: tuple[str, ...] = ()) -> ViewSource:
 
 
 def track_of(source: ViewSource, robot: str):
-    return source.buffer.tree_snapshot().robots[robot]
+    return feed_of(source.buffer).tree_snapshot().robots[robot]
 
 
 def test_snapshot_poses_equal_buffer_lookups():

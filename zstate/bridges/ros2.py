@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 
 from zstate._util.closeable import Closeable
 from zstate.bridges.transforms import TransformRelay, edge_writer_of_node
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.errors import Closed, InvalidInput, MessageError, ZStateError
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
@@ -106,7 +106,7 @@ class StaticBridge(Closeable):
         """Publish the accepted edges that are new or changed, and withdraw those that are no longer there."""
         accepted = {
             child: Transform.from_pose7(edge.parent, child, edge.pose)
-            for child, edge in self._buffer.tree_snapshot().edges.items()
+            for child, edge in feed_of(self._buffer).tree_snapshot().edges.items()
             if edge is not None and edge.kind == "static" and edge.robot is None
         }
         for child, before in list(self._published.items()):

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.other_names import with_tf2_methods
 from zstate.buffer.core import BufferCore
+from zstate.buffer.feed import BufferFeed
 from zstate.buffer.history import HistoryView
 from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
@@ -89,7 +90,7 @@ class TransformBuffer(BufferCore):
         robots = [repr(track.name) for track in list(self._tree.robots.values()) if track is not None]
         more = f" and {len(robots) - 3} more" if len(robots) > 3 else ""
         named = f" of {', '.join(robots[:3])}{more}" if robots else ""
-        kept = "of a recording" if self.is_recording else f"{self.history_s:g} s of history"
+        kept = "of a recording" if self._owner.is_recording else f"{self.history_s:g} s of history"
         return f"<TransformBuffer: {len(self._tree.frames)} frames{named}, {kept}>"
 
     def __reduce__(self) -> NoReturn:
@@ -179,7 +180,7 @@ class TransformBuffer(BufferCore):
         Rows without a transform are NaN. Stamps are integers [ns] or datetime64[ns]. Raises UnknownFrame,
         AmbiguousFrame, Disconnected and ClockMismatch.
         """
-        return self.path(target, source).poses(check_stamps(stamps))
+        return self._path(target, source).poses(check_stamps(stamps))
 
     def place(
         self, points: ArrayLike, stamps: ArrayLike, source: str, target: str
@@ -196,13 +197,13 @@ class TransformBuffer(BufferCore):
         reason of the latter, for the stamp of a row. Raises UnknownFrame, AmbiguousFrame, Disconnected and
         ClockMismatch, and InvalidInput for other shapes and types.
         """
-        path = self.path(target, source)
+        path = self._path(target, source)
         array = check_points(points)
         return path.place(array, check_stamps_of_points(stamps, len(array)))
 
     def plan(self, target: str, source: str) -> Plan:
         """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""
-        return Plan(target, source, self._tree, lambda: self.path(target, source))
+        return Plan(target, source, self._tree, lambda: self._path(target, source))
 
     def twist(self, frame: str, reference: str, at: int | None = None) -> Twist:
         """The velocity of ``frame`` in ``reference``: d/dt of ``reference_from_frame``.
@@ -212,7 +213,7 @@ class TransformBuffer(BufferCore):
         as ``lookup``, and NoData if there is one sample only, without velocities.
         """
         query = self._query(reference, frame, at)
-        motion, stamp = self.path(reference, frame).motion(query.at)
+        motion, stamp = self._path(reference, frame).motion(query.at)
         return Twist(frame, reference, motion.linear, motion.angular, stamp)
 
     def latest(self, target: str, source: str) -> int:
@@ -221,7 +222,7 @@ class TransformBuffer(BufferCore):
         Raises NoData if every edge is static, and Stale if the history of one edge begins after the last
         sample of another, which is silent.
         """
-        return self.path(target, source).latest_common_stamp()
+        return self._path(target, source).latest_common_stamp()
 
     def can_lookup(self, target: str, source: str, at: int | None = None) -> bool:
         """Whether ``lookup`` would succeed now. Raises InvalidInput for invalid names and stamps."""
@@ -326,7 +327,7 @@ class TransformBuffer(BufferCore):
                 (path.target, path.source),
                 (path.domain, self.clock.domain),
             )
-            robot = self.domain.robot_placing(edge[1])
+            robot = self._tree.domain.robot_placing(edge[1])
             raise ClockMismatch(*names, edges=(edge,), robots=(robot,), domains=domains)
         if path.uses and transform.age(self.clock) > query.max_age_s:
             # Once more, of samples that the error describes.
@@ -506,7 +507,7 @@ class TransformBuffer(BufferCore):
 
             if len(self._snapshot_readers) >= _MAX_CACHED_READERS:
                 self._snapshot_readers = {}
-            reader = self._snapshot_readers[key] = SnapshotReader(self.tree_snapshot(), key)
+            reader = self._snapshot_readers[key] = SnapshotReader(self._feed.tree_snapshot(), key)
         return reader
 
     def span(self) -> TimeSpan | None:
@@ -516,7 +517,7 @@ class TransformBuffer(BufferCore):
         """
         with self._lock:
             moving = self._tree.moving()
-        default = self.domain.name
+        default = self._tree.domain.name
         views = [
             view
             for track, edge in moving.items()
@@ -527,6 +528,11 @@ class TransformBuffer(BufferCore):
         newest = max(view.newest for view in views)
         oldest = min(view.oldest for view in views)
         return TimeSpan(max(oldest, newest - round(self.history_s * 1e9)), newest)
+
+
+def feed_of(buffer: TransformBuffer) -> BufferFeed:
+    """The feed of a buffer. It is no member of the buffer, as programs that look up do not need it."""
+    return buffer._feed  # pyright: ignore[reportPrivateUsage]  # see above
 
 
 def _required_stamps(query: Query, reason: LookupFailed, path: TransformPath) -> RequiredStamps:

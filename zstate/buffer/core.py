@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import NamedTuple
 
@@ -15,8 +14,9 @@ from zstate._util.fork_safe import fork_safe
 from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.covariance_path import compile_path_with_covariances
-from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
-from zstate.buffer.history import FastPath, HistoryView, insert_together, keep_only_around, merged
+from zstate.buffer.feed import BufferFeed
+from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies
+from zstate.buffer.history import HistoryView, insert_together, keep_only_around
 from zstate.buffer.path import TransformPath
 from zstate.buffer.pose_tracks import (
     EdgeNames,
@@ -25,11 +25,10 @@ from zstate.buffer.pose_tracks import (
     TooOld,
     check_covariances,
     check_poses,
-    checked_rows,
     second_writer,
 )
-from zstate.buffer.tracks import JointTrack, PoseTrack, Track, TrackOwner
-from zstate.buffer.waiting import Waiter, WaiterRegistry
+from zstate.buffer.tracks import JointTrack, Track, TrackOwner
+from zstate.buffer.waiting import WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import (
@@ -51,14 +50,6 @@ class CachedPath(NamedTuple):
     dependencies: PathDependencies
 
 
-class _PastPoses(NamedTuple):
-    """Instants of the edges of one track, newest first."""
-
-    stamps: list[int]
-    poses: list[Poses]
-    covariances: list[NDArray[np.float64] | None]
-
-
 class BufferCore:
     """Inserts and lookups. A refused insert changes nothing.
 
@@ -69,39 +60,37 @@ class BufferCore:
         if not isinstance(history_s, Real) or not 0.0 < history_s < 1e9:
             raise InvalidInput(f"history_s is a positive number of seconds, not {history_s!r}")
         self.history_s = history_s
-        self.clock: Clock = clock or SystemClock()
-        self.domain = ClockDomain(None if clock is None else clock.domain)
-        """The clock domain of each robot."""
         self.ignored = 0
         """The number of samples that were older than the history reaches."""
         self._owner = TrackOwner()
-        self.clock_offsets = self._owner.clock_offsets
-        """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
         self._span_ns = round(history_s * 1e9)
         self._lock = fork_safe(threading.RLock())
         self._writes = 0
-        self._tree = FrameTree(self.domain)
+        self._tree = FrameTree(ClockDomain(None if clock is None else clock.domain))
         self._waiters = WaiterRegistry(self._tree)
         self._pose_tracks = PoseTrackTable(self._tree, self._span_ns, self._owner)
         self._paths: dict[tuple[str, str], CachedPath] = {}
         self._stop_reason = ""
+        inserts = type(self).insert_joints, type(self).insert_many
+        self._feed = BufferFeed(
+            self._tree,
+            self._pose_tracks,
+            self._waiters,
+            self._owner,
+            lock=self._lock,
+            clock=clock or SystemClock(),
+            span_ns=self._span_ns,
+            has_own_inserts=inserts != (BufferCore.insert_joints, BufferCore.insert_many),
+        )
 
     @property
-    def is_recording(self) -> bool:
-        """Whether the samples come from a file: no sample is added later."""
-        return self._owner.is_recording
-
-    @is_recording.setter
-    def is_recording(self, value: bool) -> None:
-        self._owner.is_recording = value
+    def clock(self) -> Clock:
+        """The clock that ages are measured by."""
+        return self._feed.clock
 
     def stop(self, reason: str) -> None:
         """No more samples will come: waits fail at once, and errors name the reason. Lookups go on."""
         self._stop_reason = self._stop_reason or reason
-
-    def explain_unknown(self, hint: Callable[[int], str] | None) -> None:
-        """Let errors about unknown frames end with ``hint(count)``, of the number of frames; "" is none."""
-        self._tree.hint = hint
 
     def add_robot(self, model: RobotModel, prefix: str = "") -> JointTrack:
         """Add all links of ``model``; its fixed joints need no samples. Returns the track for the others.
@@ -143,7 +132,7 @@ class BufferCore:
         Its track accepts no more samples. Raises InsertRefused for a track that is not of this buffer.
         """
         with self._lock:
-            self._check_owned(track)
+            self._owner.check(track)
             track.owner = None
             track.history.close()
             for name, edge in list(self._tree.frames.items()):
@@ -153,63 +142,6 @@ class BufferCore:
                     self._tree.detach(name)
             if self._tree.robots.get(track.prefix) is track:
                 self._tree.robots[track.prefix] = None
-
-    def add_part(self, robot: JointTrack, joints: Sequence[str], writer: str | None = None) -> JointTrack:
-        """A track for some ``joints`` of a robot, which one of its drivers publishes.
-
-        Its positions are in the order of ``joints``. It moves no edge before ``assign_joints``. Raises
-        InvalidInput as ``RobotModel.part``, InsertRefused for a track that is not of this buffer.
-        """
-        track = JointTrack(robot.model.part(joints), robot.prefix, self._span_ns)
-        with self._lock:
-            self._check_owned(robot)
-            track.owner, track.writer, track.model_writer = self._owner, writer, robot.model_writer
-        return track
-
-    def assign_joints(self, robot: JointTrack, parts: Mapping[str, JointTrack]) -> None:
-        """Set which of a robot's parts moves which of its driven joints; the track ``robot`` moves the rest.
-
-        Lookups read each joint, and the joints that mimic it, from the samples of its own part. Raises
-        InsertRefused for a track that is not of this buffer.
-        """
-        with self._lock:
-            self._check_owned(robot)
-            robot.parts = dict(parts)
-            for form, joint in zip(robot.forms, robot.model.joints, strict=True):
-                parent, child = robot.edge(form)
-                edge = self._tree.frames[child]
-                track = parts.get(robot.model.mimic_of(joint).joint, robot)
-                if form.kind != "fixed" and (edge is None or edge.track is not track):
-                    index = [part.name for part in track.model.joints].index(joint.name)
-                    self._tree.attach(Edge(parent, child, "joint", track=track, index=index, robot=robot))
-        self._waiters.notify()
-
-    def name_robot(self, prefix: str) -> None:
-        """Let inserts use bare names for frames ``prefix/...``, as they may for a robot's."""
-        with self._lock:
-            self._tree.robots.setdefault(prefix, None)
-
-    def add_frames(self, names: Iterable[str]) -> None:
-        """Add frames by their full names, so that these names mean no robot's frames."""
-        with self._lock:
-            for name in names:
-                self._tree.add_frame(name)
-
-    def edge_named(self, names: EdgeNames) -> EdgeNames:
-        """The full names of an edge, as an insert resolves them; a name that is not unique is unchanged."""
-        with self._lock, suppress(InsertRefused):
-            return self._tree.resolve_for_insert(names[0]), self._tree.resolve_for_insert(names[1])
-        return names
-
-    def set_domain(self, robot: str, domain: str) -> bool:
-        """Set the clock ``domain`` that stamps the samples of ``robot``. Returns whether that is a change."""
-        with self._lock:
-            changed = self.domain.set(robot, domain)
-            if changed:
-                self._tree.version += 1
-        if changed:
-            self._waiters.notify()
-        return changed
 
     def insert_joints(
         self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
@@ -224,7 +156,7 @@ class BufferCore:
         """
         with self._lock:
             if track.owner is not self._owner:
-                self._check_owned(track)
+                self._owner.check(track)
             inserted = None
             if track.has_plain_joints:
                 inserted = track.history.try_insert(stamp, positions, velocities, track.position_count)
@@ -238,143 +170,12 @@ class BufferCore:
         checked = track.check_positions(positions)
         rates = None if velocities is None else track.model.check_velocities(velocities)
         with self._lock:
-            self._check_owned(track)  # again: the robot may have been removed since
+            self._owner.check(track)  # again: the robot may have been removed since
             had_velocities = track.has_velocities
             inserted = track.insert(stamp, checked, rates)
             if track.has_velocities != had_velocities:
                 self._tree.invalidate(track)
         return self._count(track, inserted=inserted)
-
-    def insert_past_joints(
-        self, track: JointTrack, samples: Iterable[tuple[int, ArrayLike, ArrayLike | None]]
-    ) -> int:
-        """Insert instants of a robot, newest first, all of them with one copy of its history.
-
-        An instant is a stamp [ns], positions and velocities, as ``insert_joints`` takes them.
-
-        Returns how many were inserted: those before the first one that ``insert_joints`` has to handle, as
-        it is not older than the one before it, or not usable, or because the row has no column for it. None
-        is inserted if all that the track has is newer: then each insert costs the same. Raises InsertRefused
-        as ``insert_joints``.
-        """
-        stamps: list[int] = []
-        rows: list[NDArray[np.float64]] = []
-        with self._lock:
-            self._check_owned(track)
-            oldest, newest = track.history.oldest, track.history.newest
-            if oldest is None or newest is None or self._has_own_inserts():
-                return 0
-            for stamp, positions, velocities in samples:
-                newest = max(newest, stamp)
-                is_next = not stamps or stamp < stamps[-1]
-                if not is_next or stamp < newest - track.history.span_ns:
-                    break
-                if velocities is not None and not track.has_velocities:
-                    break
-                try:
-                    rates = None if velocities is None else track.model.check_velocities(velocities)
-                    rows.append(track.row(track.check_positions(positions), rates))
-                except InvalidInput:
-                    break
-                stamps.append(stamp)
-            if not stamps or stamps[0] < oldest:
-                return 0
-            times = np.array(stamps[::-1], dtype=np.int64)
-            track.history = merged(track.history, times, np.array(rows[::-1]))
-            self._tree.invalidate(track)
-        self._waiters.notify(track)
-        return len(stamps)
-
-    def insert_past_poses(
-        self,
-        samples: Iterable[tuple[tuple[EdgeNames, ...], int, Poses, NDArray[np.float64] | None]],
-        writer: str | None = None,
-    ) -> int:
-        """Insert instants of moving edges, newest first, all of them with one copy of each history.
-
-        An instant is edges, a stamp [ns], poses (N, 7) and covariances (N, 21), as for ``insert_many``.
-
-        Returns how many were inserted: those before the first one that ``insert_many`` has to handle, as it
-        is not older than the one before it of its edges, or because the row has no columns for it, or its
-        edges are in several tracks. None is inserted if all that the tracks have is newer. Raises
-        InvalidInput if one is not usable; then none is inserted.
-        """
-        past: dict[PoseTrack, _PastPoses] = {}
-        count = 0
-        with self._lock:
-            version = self._tree.version
-            for edges, stamp, poses, covariances in () if self._has_own_inserts() else samples:
-                try:
-                    (track, rows), *others = self._pose_tracks.track_rows(edges, stamp, writer)
-                except TooOld:
-                    break
-                if others or (covariances is not None and not track.has_covariances):
-                    break
-                of_track = past.get(track) or _PastPoses([], [], [])
-                stamps = of_track.stamps
-                if stamps and not stamps[0] - track.history.span_ns <= stamp < stamps[-1]:
-                    break
-                past[track] = of_track
-                stamps.append(stamp)
-                of_track.poses.append(poses[rows])
-                of_track.covariances.append(None if covariances is None else covariances[rows])
-                count += 1
-            oldest = {track: track.history.oldest for track in past}
-            is_between = any(at is not None and past[track].stamps[0] >= at for track, at in oldest.items())
-            if not is_between or self._tree.version != version:
-                return 0
-            blocks = {track: checked_rows(track, one.poses, one.covariances) for track, one in past.items()}
-            for track, one in past.items():
-                times = np.array(one.stamps[::-1], dtype=np.int64)
-                track.history = merged(track.history, times, blocks[track][::-1])
-                self._tree.invalidate(track)
-        self._waiters.notify(*past)
-        return count
-
-    def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
-        """A fast path into this buffer for the messages of one writer, see ``FastPath``."""
-        return self._waiters.fast_path(counts, *sources)
-
-    def expect_next(
-        self,
-        fast_path: FastPath[Waiter],
-        place: JointTrack | tuple[EdgeNames, ...],
-        message: bytes,
-        *versions: int,
-    ) -> None:
-        """Let ``fast_path`` insert the message after ``message``, whose sample was inserted just now.
-
-        ``place`` is the track of its joints, or its edges. None is expected if the samples need further
-        checks: those of floating joints, of edges in several tracks, or any unless the clock is the system's.
-        Nor is one if a subclass overrides the methods that insert samples, for instance to measure them.
-        """
-        if type(self.clock) is not SystemClock or self._has_own_inserts():
-            return
-        if not isinstance(place, JointTrack):
-            track = self._pose_tracks.whole_track(place)
-        else:
-            track = place if place.has_plain_joints else None
-        if track is not None:
-            self._waiters.expect_next(fast_path, track, message, versions)
-
-    def _has_own_inserts(self) -> bool:
-        """Whether a subclass overrides the methods that insert samples, for instance to measure them."""
-        methods = type(self).insert_joints, type(self).insert_many
-        return methods != (BufferCore.insert_joints, BufferCore.insert_many)
-
-    def _check_owned(self, track: Track) -> None:
-        if track.owner is self._owner:
-            return
-        if isinstance(track, JointTrack) and track.owner is None:
-            text = f"the robot {track.name!r} was removed from its buffer; add_robot gives a new track"
-            reason = "removed robot"
-        else:
-            text = f"the track {track.name!r} belongs to another buffer; use the buffer that made it"
-            reason = "another buffer"
-        edge = (
-            (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
-        )
-        raise InsertRefused(text, reason=reason, edge=edge)
 
     def _robot_track(self, robot: str) -> JointTrack:
         """The track of a robot by its name. Raises InvalidInput, which names the most similar ones."""
@@ -388,16 +189,6 @@ class BufferCore:
                     f"there is no robot {robot!r} in this buffer{did_you_mean(robot, names)} ({known})"
                 )
         return track
-
-    def restart(self, track: JointTrack | PoseTrack) -> None:
-        """Begin a new epoch: remove the samples of one track, because its writer or its clock restarted.
-
-        Raises InsertRefused for a track that is not of this buffer.
-        """
-        with self._lock:
-            self._check_owned(track)
-            track.history.clear()
-        self._waiters.notify_restart(track)
 
     def insert(self, transform: Transform, *, writer: str | None = None) -> bool:
         """One sample of a moving edge: ``transform.target`` is the parent, ``source`` the child.
@@ -557,39 +348,7 @@ class BufferCore:
                 *((edge.child, info(edge.child)) for edge in down),
             ]
 
-    def edge_of(self, frame: str) -> Edge | None:
-        """The edge that places a frame, by its full name."""
-        with self._lock:
-            return self._tree.frames.get(frame)
-
-    def is_model_root(self, frame: str) -> bool:
-        """Whether a frame, by its full name, is the root of a robot's model."""
-        with self._lock:
-            ends = (at for at, letter in enumerate(frame) if letter == "/")
-            tracks = (self._tree.robots.get(frame[:end]) for end in (0, *ends))
-            return any(track is not None and track.frame(track.model.root) == frame for track in tracks)
-
-    def tree_snapshot(self) -> TreeSnapshot:
-        """All frames with their edges and all robots with their tracks."""
-        with self._lock:
-            return self._tree.snapshot()
-
-    def use_clock(self, clock: Clock) -> None:
-        """Measure ages with ``clock``. Raises InvalidInput if a clock of another domain was given before."""
-        given = self.domain.given
-        if given not in (None, clock.domain):
-            raise InvalidInput(
-                f"the buffer was given a clock of {given!r} time, and now one of {clock.domain!r} time; "
-                "give both the same, or a buffer without a clock"
-            )
-        self.clock, self.domain.given = clock, clock.domain
-        self._tree.version += 1  # ends the fast paths, which compare stamps with the system's clock
-
-    def domain_between(self, target: str, source: str) -> str | None:
-        """The clock domain of transforms between two frames, None if not known. Raises as ``plan``."""
-        return self.path(target, source).domain or None
-
-    def path(self, target: str, source: str, *, compiled: bool = True) -> TransformPath:
+    def _path(self, target: str, source: str, *, compiled: bool = True) -> TransformPath:
         """The cached path between two frames; a new one without the extension if not ``compiled``."""
         check_names(target, source)
         if compiled:
@@ -601,11 +360,11 @@ class BufferCore:
     def _paths_of(self, *pairs: tuple[str, str]) -> list[TransformPath]:
         """The paths between pairs of frames, all of them of one state of the tree."""
         version = self._tree.version
-        paths = [self.path(*pair) for pair in pairs]
+        paths = [self._path(*pair) for pair in pairs]
         if self._tree.version == version:
             return paths
         with self._lock:
-            return [self.path(*pair) for pair in pairs]
+            return [self._path(*pair) for pair in pairs]
 
     def _cached_path(self, target: str, source: str) -> CachedPath:
         version, cached = self._tree.version, self._paths.get((target, source))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
+from zstate.errors import InsertRefused
 from zstate.model.joint_history import JointHistory
 from zstate.model.joint_transforms import JointTransform, shared_transforms
 from zstate.model.kinematics import Kinematics
@@ -36,6 +37,21 @@ class TrackOwner:
     """By writer: how far its clock is ahead of the clock of this host."""
     is_recording: bool = False
     """Whether the samples come from a file: no sample is added later."""
+
+    def check(self, track: Track) -> None:
+        """Raises InsertRefused for a track that is not of this buffer."""
+        if track.owner is self:
+            return
+        if isinstance(track, JointTrack) and track.owner is None:
+            text = f"the robot {track.name!r} was removed from its buffer; add_robot gives a new track"
+            reason = "removed robot"
+        else:
+            text = f"the track {track.name!r} belongs to another buffer; use the buffer that made it"
+            reason = "another buffer"
+        edge = (
+            (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
+        )
+        raise InsertRefused(text, reason=reason, edge=edge)
 
 
 class JointTrack:

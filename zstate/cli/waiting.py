@@ -257,7 +257,8 @@ class PoseWaiter:
         buffer = self._listener.buffer
         if transform.stamp is None:
             return None
-        if (buffer.domain_between(*self._frames) or buffer.clock.domain) != buffer.clock.domain:
+        domains = {frame.domain for _, frame in buffer.path_frames(*self._frames) if frame is not None}
+        if not domains <= {None, buffer.clock.domain}:
             return None
         return transform.age(buffer.clock)
 

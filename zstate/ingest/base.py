@@ -58,6 +58,7 @@ class StreamIngest(ABC):
         """Whether any message of this robot has arrived."""
         self._ownership = ownership
         self._buffer = ownership.buffer
+        self._feed = ownership.feed
         self._counters = ownership.counters.for_robot(robot)
         self._on_set_back = on_set_back
         self._sessions = WriterSessions(ownership.clock)
@@ -69,10 +70,10 @@ class StreamIngest(ABC):
         self._last_late: Sample | None = None
         self._has_joined_domain = False
         self._fast_order = b""
-        self._fast_path = self._buffer.fast_path(self._counters.fast_counts, ownership)
+        self._fast_path = self._feed.fast_path(self._counters.fast_counts, ownership)
         self._is_dropped = False
         self._lock = _IngestLock(self._stop_fast_path)
-        self._buffer.name_robot(robot)
+        self._feed.name_robot(robot)
 
     @property
     def session(self) -> int | None:
@@ -96,7 +97,7 @@ class StreamIngest(ABC):
         with self._lock:
             if self._sessions.leave(session):
                 self._has_joined_domain = False
-                self._buffer.domain.leave(self.robot)
+                self._feed.domain.leave(self.robot)
 
     def drop(self) -> None:
         """Remove all samples and edges of this writer from the buffer. Later samples are refused.
@@ -159,7 +160,7 @@ class StreamIngest(ABC):
         place = self._fast_place(sample)
         if place is not None and self._has_joined_domain and self._newest_of(sample) == sample.stamp:
             self._fast_order = sample.order
-            self._buffer.expect_next(self._fast_path, place, message, version)
+            self._feed.expect_next(self._fast_path, place, message, version)
 
     def _stop_fast_path(self) -> None:
         """Take over the state that the fast path has advanced."""
@@ -273,7 +274,7 @@ class StreamIngest(ABC):
         self._counters.count("received" if inserted else "late")
         if not self._has_joined_domain and sample.session != self._sessions.departed:
             self._has_joined_domain = True
-            self._buffer.domain.join(self.robot)
+            self._feed.domain.join(self.robot)
         return inserted
 
     def _count_refusal(self, error: InvalidInput | MessageError) -> None:
@@ -289,8 +290,8 @@ class StreamIngest(ABC):
     def _update_domain(self) -> bool:
         """Pass the clock domain of the current writer to the buffer; True if it replaces another one."""
         domain = self._descriptions.domain(self._sessions.current)
-        before = self._buffer.domain.domain_of(self.robot)
-        return domain is not None and self._buffer.set_domain(self.robot, domain) and bool(before)
+        before = self._feed.domain.domain_of(self.robot)
+        return domain is not None and self._feed.set_domain(self.robot, domain) and bool(before)
 
     def _advance(self, sample: Sample) -> bool:
         """Update the newest stamp; True if the sample is so old that the clock may have been set back."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.edge_rules import loop_refusal
 from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
@@ -160,6 +160,7 @@ class FrameOwnership:
         clock: Clock | None = None,
     ) -> None:
         self.buffer = buffer
+        self.feed = feed_of(buffer)
         self.counters = counters
         self.clock = MonotonicClock() if clock is None else clock
         self.version = 0
@@ -270,7 +271,7 @@ class FrameOwnership:
         for joint in model.joints:
             self._withdraw(robot, joint.child, "second writer", "a link of the model")
         root = top = f"{robot}/{model.root}"
-        while (above := self.buffer.edge_of(top)) is not None:
+        while (above := self.feed.edge_of(top)) is not None:
             top = above.parent
         if top != root and top in {f"{robot}/{link}" for link in model.links}:
             # The edges between are valid children of the model; the one that places its root closes the loop.
@@ -279,7 +280,7 @@ class FrameOwnership:
     def _withdraw(self, robot: str, link: str, reason: str, what: str) -> None:
         """Withdraw an edge that conflicts with a model. Claims are reported when they are resolved."""
         frame = f"{robot}/{link}"
-        edge = self.buffer.edge_of(frame)
+        edge = self.feed.edge_of(frame)
         if edge is not None:
             self.buffer.withdraw(frame)
             if frame not in self._claims:
@@ -330,7 +331,7 @@ class FrameOwnership:
             if len(claims) > 1:
                 return len(self._ring(claim.child)) > 1
             seen.add(frame)
-            edge = claims[0] if claims else self.buffer.edge_of(frame)
+            edge = claims[0] if claims else self.feed.edge_of(frame)
             if edge is None:
                 return False
             frame = edge.parent
@@ -439,7 +440,7 @@ class FrameOwnership:
 
     def _named(self, names: EdgeNames) -> EdgeNames:
         # In ROS a slash in a name has no meaning, and the name may be that of a link of the robot.
-        return self.buffer.edge_named(names) if self._is_shared else names
+        return self.feed.edge_named(names) if self._is_shared else names
 
     def _claim(self, source: EdgeSource, names: EdgeNames) -> EdgeClaim:
         claim = source.claims.get(names)
@@ -485,7 +486,7 @@ class FrameOwnership:
 
     def _is_root_of_model(self, frame: str) -> bool:
         is_published = self._model_parents[frame] > 0 and not self._model_children[frame]
-        return is_published or self.buffer.is_model_root(frame)
+        return is_published or self.feed.is_model_root(frame)
 
     def _drop(self, claim: EdgeClaim) -> None:
         source, child = claim.source, claim.child
@@ -516,7 +517,7 @@ class FrameOwnership:
 
     def _is_in_buffer(self, claim: EdgeClaim) -> bool:
         """Whether it places its child there: the caller may have changed the buffer, too."""
-        return claim.is_accepted and _is_edge_of(claim, self.buffer.edge_of(claim.child))
+        return claim.is_accepted and _is_edge_of(claim, self.feed.edge_of(claim.child))
 
     def _insert(self, claim: EdgeClaim) -> None:
         assert claim.pose is not None
@@ -529,8 +530,8 @@ class FrameOwnership:
 
     def _add_frames(self, claim: EdgeClaim) -> None:
         # Not if these are bare names of a robot's frames.
-        if self.buffer.edge_named(claim.names) != claim.names:
-            self.buffer.add_frames(claim.names)
+        if self.feed.edge_named(claim.names) != claim.names:
+            self.feed.add_frames(claim.names)
 
     def _rank(self, claim: EdgeClaim) -> Rank:
         robot, owner = claim.source.robot, frame_owner(claim.child)
@@ -630,13 +631,13 @@ class FrameOwnership:
 
     def _candidate_parents(self, child: str) -> set[str]:
         parents = {claim.parent for claim in self._claims.get(child, ())}
-        if edge := self.buffer.edge_of(child):
+        if edge := self.feed.edge_of(child):
             parents.add(edge.parent)
         return parents
 
     def _unclaimed_edge(self, child: str) -> EdgeClaim | None:
         """The edge in the buffer that places ``child``, unless a source publishes it."""
-        edge = self.buffer.edge_of(child)
+        edge = self.feed.edge_of(child)
         if edge is None:
             return None
         is_static, is_model = edge.kind == "static", edge.robot is not None

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.feed import BufferFeed
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, MessageError
 from zstate.ingest.base import ClockSetBack, StreamIngest
@@ -40,9 +40,7 @@ def joint_order(model: RobotModel) -> JointOrder:
     return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
 
 
-def insert_past(
-    buffer: TransformBuffer, track: JointTrack, order: JointOrder, samples: Sequence[Sample]
-) -> int:
+def insert_past(feed: BufferFeed, track: JointTrack, order: JointOrder, samples: Sequence[Sample]) -> int:
     """Insert the first of ``samples``, newest first, with one copy of the track's history; how many."""
     past: list[tuple[int, ArrayLike, ArrayLike | None]] = []
     for sample in samples:
@@ -52,7 +50,7 @@ def insert_past(
         except MessageError:
             break
         past.append((sample.stamp, numbers.positions, numbers.velocities))
-    return buffer.insert_past_joints(track, past)
+    return feed.insert_past_joints(track, past)
 
 
 class JointNames:
@@ -111,7 +109,7 @@ class RobotParts:
     def __init__(self, robot: str, ownership: FrameOwnership) -> None:
         self._robot = robot
         self._ownership = ownership
-        self._buffer = ownership.buffer
+        self._feed = ownership.feed
         self._counters = ownership.counters.for_robot(robot)
         self._names = ownership.live
         self._whole: JointPart | None = None
@@ -172,7 +170,7 @@ class RobotParts:
         """Remove the samples of a writer: its clock was set back."""
         with self._lock:
             for part in self._parts_of(session):
-                self._buffer.restart(part.track)
+                self._feed.restart(part.track)
 
     def part_of(self, state: JointState, *, others: bool) -> JointPart | None:
         """The part that a sample belongs to; None while the model is not known.
@@ -201,7 +199,7 @@ class RobotParts:
             if len(own) >= _MAX_SETS:
                 text = f"a writer of more than {_MAX_SETS} sets of joints; now {', '.join(map(repr, joints))}"
                 raise MessageError(text, reason="too many sets of joints")
-            track = self._buffer.add_part(whole, joints, self._names.get((self._robot, session)))
+            track = self._feed.add_part(whole, joints, self._names.get((self._robot, session)))
             appeared = own[0].appeared if own else next(self._moments)
             part = JointPart(session, joints, track, joint_order(track.model), appeared)
             track.check_positions(part.order.read(state).positions)  # unusable ones take no joint
@@ -228,7 +226,7 @@ class RobotParts:
                 part.refusal = None
                 movers.update({joint: part for joint in part.joints if joint not in movers})
         tracks = {joint: part.track for joint, part in movers.items() if part is not whole}
-        self._buffer.assign_joints(whole.track, tracks)
+        self._feed.assign_joints(whole.track, tracks)
 
     def _precedence(self, part: JointPart) -> JointPrecedence:
         session = part.session or 0
@@ -300,7 +298,7 @@ class PartialJointStateIngest(StreamIngest):
         part = self._parts.part_of(samples[0], others=self._others)
         if part is None or any(sample.order != samples[0].order for sample in samples):
             return 0
-        return insert_past(self._buffer, part.track, part.order, samples)
+        return insert_past(self._feed, part.track, part.order, samples)
 
     def _fast_place(self, sample: Sample) -> JointTrack | None:
         assert isinstance(sample, JointState)

@@ -74,7 +74,7 @@ class JointStateIngest(StreamIngest):
         return self._buffer.insert_joints(track, sample.stamp, numbers.positions, numbers.velocities)
 
     def _insert_past(self, samples: Sequence[Sample]) -> int:
-        return 0 if self._track is None else insert_past(self._buffer, self._track, self._order, samples)
+        return 0 if self._track is None else insert_past(self._feed, self._track, self._order, samples)
 
     def _fast_place(self, sample: Sample) -> JointTrack | None:
         return self._track if sample.order == self._order.digest else None
@@ -84,7 +84,7 @@ class JointStateIngest(StreamIngest):
 
     def _drop_history(self) -> None:
         if self._track is not None:
-            self._buffer.restart(self._track)
+            self._feed.restart(self._track)
 
     def _on_writer_changed(self) -> None:
         self.parts.set_whole_writer(self.session)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import counts_from_start, format_duration, guess_unit
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import FAR_NS, LATE_NS, SYSTEM, format_stamp
 from zstate.ingest.counters import Counters
 from zstate.wire.messages import Sample, TransformSample
@@ -30,6 +30,7 @@ class StampCheck:
 
     def __init__(self, buffer: TransformBuffer, counters: Counters, *, is_described: bool) -> None:
         self._buffer = buffer
+        self._domain = feed_of(buffer).domain
         self._counters = counters
         self._is_described = is_described
         self._reported: BoundedDict[tuple[str, str], None] = BoundedDict()
@@ -46,7 +47,7 @@ class StampCheck:
 
     def check(self, robot: str, writer: str | None, sample: Sample) -> None:
         """Check a sample outside the accepted range."""
-        domain = self._buffer.domain.domain_of(robot)
+        domain = self._domain.domain_of(robot)
         if domain is None and self._is_described:
             # The description names the clock, and may not have arrived yet.
             is_on_system_clock = isinstance(sample, TransformSample) and sample.edges is not None

@@ -74,7 +74,7 @@ class TransformIngest(StreamIngest):
             self._release(self._described)
             self._edges, self._order = edges, order
             self._ownership.add_description(self.robot)
-            self._buffer.domain.assign(self.robot, (child for _, child in edges))
+            self._feed.domain.assign(self.robot, (child for _, child in edges))
             self._insert_early()
 
     def _named(self, edges: Edges) -> Edges:
@@ -137,7 +137,7 @@ class TransformIngest(StreamIngest):
             if edges is None:
                 break
             past.append((edges, sample.stamp, poses_from_block(sample.poses), covariances_of(sample)))
-        return self._buffer.insert_past_poses(past, self.writer)
+        return self._feed.insert_past_poses(past, self.writer)
 
     def _named_edges(self, names: Edges) -> Edges:
         edges = self._full_names.get(names)
@@ -148,7 +148,7 @@ class TransformIngest(StreamIngest):
             edges = self._full_names[names] = self._named(names)
             new = {child for _, child in edges} - {child for _, child in self._undescribed.claims}
             self._ownership.replace_departed(self._undescribed, new)
-            self._buffer.domain.assign(self.robot, new)
+            self._feed.domain.assign(self.robot, new)
         return edges
 
     def _admit(self, source: EdgeSource, edges: Edges) -> Admitted:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from zstate._util.closeable import Closeable
 from zstate._util.format import did_you_mean
-from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
+from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer, feed_of
 from zstate.clock import Clock
 from zstate.errors import InvalidInput
 from zstate.ingest.counters import Counters, ListenerStats
@@ -86,7 +86,7 @@ class TransformListener(Closeable):
         self.robot = self._robots[0] if len(self._robots) == 1 else ANY
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         if clock is not None:
-            self.buffer.use_clock(clock)
+            feed_of(self.buffer).use_clock(clock)
         placers = _checked_placers(placers, self._wire)
         self._counters = Counters()
         self._session, self._pid = session, os.getpid()
@@ -119,7 +119,7 @@ class TransformListener(Closeable):
                 )
             )
             self._opened = opening.pop_all()
-        self.buffer.explain_unknown(self._explain_unknown)
+        feed_of(self.buffer).explain_unknown(self._explain_unknown)
         _LISTENERS.add(self)
 
     def __repr__(self) -> str:
@@ -171,7 +171,7 @@ class TransformListener(Closeable):
     def close(self) -> None:
         """Stop listening; the buffer keeps its samples. A second call does nothing."""
         _LISTENERS.discard(self)
-        self.buffer.explain_unknown(None)
+        feed_of(self.buffer).explain_unknown(None)
         self._opened.close()
 
     def _explain_unknown(self, frame_count: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from zstate._util.closeable import Closeable
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import SYSTEM
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
@@ -45,7 +45,8 @@ class ListenerDiagnostics(Diagnostics, Closeable):
         self._stamp_check = StampCheck(buffer, counters, is_described=not wire.shared)
         self._clock_offsets: ClockOffsetMonitor | None = None
         if not wire.shared and buffer.clock.domain == SYSTEM:
-            self._clock_offsets = ClockOffsetMonitor(session, thread, buffer.clock, buffer.clock_offsets)
+            offsets = feed_of(buffer).clock_offsets
+            self._clock_offsets = ClockOffsetMonitor(session, thread, buffer.clock, offsets)
         streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._streams)
         self._events = EventLog(streams, follow, wire.shared, on_event)
         self._has_deadlines = on_event is not None

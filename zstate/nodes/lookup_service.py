@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import AmbiguousFrame, ZStateError
 from zstate.model.robot import RobotModel
@@ -75,7 +75,7 @@ class RecentBuffer:
                 sample = (track, state.stamp, from_block(state.positions), rates)
                 if not buffer.insert_joints(*sample):
                     # The writer's clock was set back: earlier samples are another epoch.
-                    buffer.restart(track)
+                    feed_of(buffer).restart(track)
                     buffer.insert_joints(*sample)
                 self._next_seq = cached.seq + 1
         return buffer

@@ -108,7 +108,7 @@ class InstrumentedBuffer(TransformBuffer):
         writer: str | None = None,
     ) -> bool:
         inserted = super().insert_many(edges, stamp, poses, covariances=covariances, writer=writer)
-        self._on_sample(self.domain.robot_placing(edges[0][1]), "transforms", stamp)
+        self._on_sample(self._feed.domain.robot_placing(edges[0][1]), "transforms", stamp)
         return inserted
 
     def _on_sample(self, robot: str, kind: SampleKind, stamp: int) -> None:
@@ -118,7 +118,7 @@ class InstrumentedBuffer(TransformBuffer):
 
     def _is_comparable(self, robot: str) -> bool:
         """Whether the samples of ``robot`` are stamped in the clock domain of this buffer's clock."""
-        return (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain
+        return (self._feed.domain.domain_of(robot) or self.clock.domain) == self.clock.domain
 
 
 _WINDOW_NS = 5_000_000_000

@@ -25,6 +25,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from operator import is_
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
@@ -33,7 +34,7 @@ from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.errors import InvalidInput, LibraryMissing, LookupFailed, RecordingError
 from zstate.model.joint_history import JointHistory
 from zstate.recording.joint_states import DELAYED_NS, JointStateBatch
@@ -44,7 +45,7 @@ from zstate.wire.messages import Sample
 if TYPE_CHECKING:
     from pyarrow.parquet import ParquetWriter
 
-    from zstate.buffer.frame_tree import FrameInfo
+    from zstate.buffer.frame_tree import Edge, FrameInfo
 
 TableFormat = Literal["csv", "parquet"]
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
@@ -299,7 +300,7 @@ class StreamedBuffer:
         self._messages = recording.fill(self._buffer)
         self._newest = -(1 << 63)
         self._returned: int | None = None
-        self._layout: tuple[Sequence[object], Sequence[FrameInfo]] = (), ()
+        self._layout: tuple[Sequence[Edge], Sequence[FrameInfo]] = (), ()
 
     def around(self, stamps: NDArray[np.int64]) -> TransformBuffer:
         """The buffer for the next of the stamps. Raises LookupFailed for frames without a path."""
@@ -351,19 +352,22 @@ class StreamedBuffer:
     def _check(self) -> None:
         """Raise _Changed if frames, edges or the beginnings of histories are others than before."""
         try:
-            layout = [self._buffer.path(*pair) for pair in self._poses], self._moving_frames()
+            edges = [edge for pair in self._poses for edge in feed_of(self._buffer).edges_between(*pair)]
+            frames = self._moving_frames()
         except LookupFailed:
             if self._returned is None:
                 raise
             raise _Changed from None
         if self._returned is not None:
-            paths = zip(layout[0], self._layout[0], strict=True)
-            beginnings = [
-                [(one.name, one.oldest) for one in frames] for frames in (layout[1], self._layout[1])
-            ]
-            if beginnings[0] != beginnings[1] or any(path is not before for path, before in paths):
+            edges_before, frames_before = self._layout
+            are_same = len(edges) == len(edges_before) and all(map(is_, edges, edges_before))
+            if not are_same or _beginnings(frames) != _beginnings(frames_before):
                 raise _Changed
-        self._layout = layout
+        self._layout = edges, frames
+
+
+def _beginnings(frames: Sequence[FrameInfo]) -> list[tuple[str, int | None]]:
+    return [(frame.name, frame.oldest) for frame in frames]
 
 
 class ReloadedBuffer:
@@ -382,7 +386,7 @@ class ReloadedBuffer:
             window = self._stamps[: max(len(stamps), _RELOADED_ROWS)]
             self._buffer = self._recording.buffer(window)
             for target, source in self._poses:
-                self._buffer.path(target, source)
+                self._buffer.plan(target, source)
             self._rows = len(window)
         self._stamps = self._stamps[len(stamps) :]
         self._rows -= len(stamps)

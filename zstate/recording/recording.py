@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.checks import Points, check_points
 from zstate.clock import check_stamps, check_stamps_of_points
 from zstate.errors import InvalidInput
@@ -186,7 +186,7 @@ class Recording(Closeable):
         robots: Collection[str] | None,
         streams: Collection[StreamName],
     ) -> Iterator[DecodedMessage]:
-        buffer.is_recording = True
+        feed_of(buffer).set_recording()
         recording = DecodedRecording(self._reader, counters.count_refusal)
         shares_frames = any(
             writer.foreign or (writer.stream == "tf_static" and writer.edge_writer is None)  # of ROS

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from zstate._util.closeable import Closeable
+from zstate.buffer.buffer import feed_of
 from zstate.buffer.snapshot import FramePoses, Poses
 from zstate.clock import SystemClock, wait_interruptible
 from zstate.model.robot import RobotModel
@@ -296,7 +297,7 @@ class PanelLayout(Closeable):
     def update(self, snapshot: FramePoses) -> None:
         """Apply the user's input, and show what has changed."""
         buffer, is_live = self._source.buffer, self.cursor.is_live
-        domain = buffer.domain.name
+        domain = feed_of(buffer).domain.name
         now = buffer.clock.now() if is_live and domain in (None, buffer.clock.domain) else None
         for panel in self._panels:
             fixed = self.fixed.resolve(snapshot.tree)

@@ -230,11 +230,12 @@ class AllEdges:
         return [self._row(frame.name, frame) for frame in frames if frame.parent is not None]
 
     def _row(self, frame: str, edge: FrameInfo | None) -> EdgeRow:
+        from zstate.buffer.buffer import feed_of
         from zstate.cli.edge_statistics import EdgeRow
 
         if edge is None:
             return EdgeRow(frame, None, None, None)
-        offset = self._listener.buffer.clock_offsets.get(edge.writer or "")
+        offset = feed_of(self._listener.buffer).clock_offsets.get(edge.writer or "")
         return EdgeRow(frame, edge, self._statistics.measure(edge), None if offset is None else offset())
 
 
