@@ -114,8 +114,11 @@ def _planes(integers: NDArray[Any]) -> bytes:
 
 def _integers(planes: NDArray[np.uint8], width: int) -> NDArray[Any]:
     """The integers (N,), unsigned, of planes (width * N,)."""
-    zigzag = np.ascontiguousarray(planes.reshape(width, -1).T).view(f"u{width}").ravel()
-    differences = (zigzag >> 1) ^ (~(zigzag & 1) + 1)
+    items = np.empty((len(planes) // width, width), np.uint8)
+    for number, plane in enumerate(planes.reshape(width, -1)):  # in a fifth of the time of a transposed copy
+        items[:, number] = plane
+    zigzag = items.view(f"u{width}").ravel()
+    differences = (zigzag >> 1) ^ -(zigzag & 1)
     return np.cumsum(differences, dtype=zigzag.dtype)
 
 
