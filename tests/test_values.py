@@ -17,6 +17,7 @@ import pytest
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import JointReading, Kinematics, Recording, Transform, TransformBuffer, Twist
+from zstate.clouds import Cloud, PlacedCloud
 from zstate.driving import DriverReport, Limits, Outcome, Setpoint
 from zstate.driving.driver_state import Spread
 from zstate.ingest.counters import ListenerStats
@@ -53,7 +54,7 @@ from zstate.scans import Grid, PlacedScan, Scan
 from zstate.sources import WheelPair
 from zstate.wire.identity import WriterId
 
-PUBLIC = ("zstate", "zstate.sources", "zstate.scans", "zstate.driving", "zstate.odometry")
+PUBLIC = ("zstate", "zstate.sources", "zstate.scans", "zstate.clouds", "zstate.driving", "zstate.odometry")
 RRBOT = load_model("rrbot")
 SCRIPT = "<script>alert('x')</script>"
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -72,6 +73,7 @@ def examples() -> list[Any]:
     buffer, vector = filled_buffer(), np.arange(3.0)
     pose = buffer.lookup("world", "tool", 15)
     scan = Scan(5, 0.0, 0.1, 10, [1.0, math.inf], 0.1, 10.0, intensities=[1.0, 2.0])
+    cloud = Cloud(5, "lidar", np.zeros(3, [(name, "f4") for name in "xyzt"]))
     writer = WriterId("driver", "host", 7, 8, 9)
     twist, covariance = BaseTwist(vector, vector), BaseCovariance(np.eye(6), np.eye(6))
     spread = Spread(1.0, 2.0, 3.0, 4.0)
@@ -91,6 +93,8 @@ def examples() -> list[Any]:
         scan,
         Grid([[0, 100], [-1, 5]], 0.5, (1.0, 2.0, 0.3)),
         PlacedScan(scan, "front", "odom", scan.points(), scan.valid),
+        cloud,
+        PlacedCloud(cloud, "front", "odom", cloud.xyz.copy(), cloud.valid),
         DriverReport(None, spread, spread, spread, 1, 0, {}),
         Limits.of(RRBOT, velocity=1.0, acceleration=2.0),
         Outcome("reached"),

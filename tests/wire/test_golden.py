@@ -17,6 +17,7 @@ from helpers.matrix_kinematics import MatrixKinematics, matrices
 from helpers.message_types import MESSAGE_TYPES
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.clouds.messages import PointField
 from zstate.driving.messages import MotionOutcome
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
@@ -120,6 +121,10 @@ PACK: dict[str, Callable[[Any], bytes]] = {
     "str": pack_str,
     "order": lambda value: pack_bin(bytes.fromhex(value)),
     "str[]": lambda value: pack_array([pack_str(text) for text in value]),
+    "bin": lambda value: pack_bin(bytes.fromhex(value)),
+    "fields": lambda value: pack_array(
+        [pack_array([pack_str(one[0]), *(pack_int(number) for number in one[1:])]) for one in value]
+    ),
     "edges": lambda value: pack_array([pack_array([pack_str(a), pack_str(b)]) for a, b in value]),
     "id": lambda value: pack_array([pack_int(int(number)) for number in value]),
     "id[]": lambda value: pack_array([PACK["id"](one) for one in value]),
@@ -166,6 +171,7 @@ SHOW: dict[type, Callable[[str, Any], Any]] = {
     tuple: lambda kind, value: [shown(kind.removesuffix("[]"), one) for one in value],
     dict: lambda kind, value: {key: shown(kind[4:-1], one) for key, one in value.items()},
     MotionOutcome: lambda _, value: list(shown_fields(value).values()),
+    PointField: lambda _, value: list(value),
 }
 
 
@@ -266,7 +272,11 @@ def test_missing_fields_have_the_defaults_of_the_page_and_nil_is_accepted_where_
 
 
 LARGEST = {"uint": 2**63 - 1, "session": 2**64 - 1, "ns": 2**63 - 1, "stamp": 2**63 - 1}
-NARROWER = {"LaserScan": ("stamp", "ray_ns", "scan_ns"), "OccupancyGrid": ("width", "height")}
+NARROWER = {
+    "LaserScan": ("stamp", "ray_ns", "scan_ns"),
+    "OccupancyGrid": ("width", "height"),
+    "PointCloud": ("height", "width", "point_step", "row_step"),
+}
 """Fields with limits that depend on others."""
 
 

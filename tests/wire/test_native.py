@@ -9,6 +9,7 @@ from helpers.message_types import MESSAGE_TYPES
 from hypothesis import given
 from hypothesis import strategies as st
 
+from zstate.clouds.messages import PointCloud, PointField
 from zstate.driving.messages import (
     DriverState,
     JointCommand,
@@ -201,6 +202,22 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"\x92"
         + pairs(*EDGES)
         + fixstr("system"),
+    ),
+    "cloud": (
+        PointCloud(
+            *(STAMP, 300, 2**63 + 5, "lidar", 1, 2, (PointField("x", 0, 7, 1),)),
+            *(False, 4, 8, to_float32_block([0.5, 1]), True, "", 0.0),
+        ),
+        header(14)[:-10]
+        + fixstr("lidar")
+        + b"\x01\x02\x91\x94"
+        + fixstr("x")
+        + b"\x00\x07\x01\xc2\x04\x08"
+        + bin8(struct.pack("<2f", 0.5, 1))
+        + b"\xc3"
+        + fixstr("")
+        + b"\xcb"
+        + struct.pack(">d", 0.0),
     ),
     "scan": (
         LaserScan(

@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from zstate import se3
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import real_numbers
-from zstate.errors import InvalidInput, LookupFailed, NoData
+from zstate.errors import InvalidInput
+from zstate.nodes.mounted_sensor import MountedSensor
 from zstate.scans.grid import Grid
 from zstate.scans.scan import Scan
 
@@ -36,9 +37,6 @@ _LEVEL_M = 1e-6
 """A laser up to this height is in the plane of the map, and measures no floor."""
 
 _WALL_HEIGHT_M = 2.5
-_RESTART_NS = 10**9
-"""A clock earlier by more than this was set back, and the laser starts again; by less, a tick was late."""
-
 _FARTHEST = 1000  # cells; a smaller square is free as well
 
 # The state of all rays while they are cast has these rows; the first five are pairs, along columns and rows.
@@ -166,72 +164,27 @@ class SimulatedLaser:
         return np.broadcast_to(array, (count,))
 
 
-class MountedLaser:
+class MountedLaser(MountedSensor):
     """A RangeSource: the sweeps of ``laser`` on a robot whose transforms are in ``buffer``.
 
-    Each ray is cast from the pose of the laser's frame ``frame`` at the ray's own stamp, and a sweep ends at
-    the newest stamp that the buffer can place, so that it is right while the robot moves. The pose is that in
-    ``map_frame`` if the buffer has that frame, else that in the root of the robot, which then stands at the
-    origin of the map's axes. Both are full names. The laser may be tilted, see ``scan_in_space``.
+    Each ray is cast from the pose of the laser's frame ``frame`` at the ray's own stamp, in ``map_frame`` or
+    in the root of the robot, see MountedSensor. The laser may be tilted, see ``scan_in_space``.
     """
 
     def __init__(self, laser: SimulatedLaser, buffer: TransformBuffer, frame: str, map_frame: str) -> None:
-        self._laser, self._buffer = laser, buffer
-        self._frame, self._map_frame = frame, map_frame
-        self._last = -1
+        super().__init__(buffer, frame, map_frame)
+        self._laser = laser
+        self._offsets = laser.stamps(0)
         self.is_off_map = False
         """Whether the laser was outside the map at its last sweep."""
 
-    @property
-    def target(self) -> str:
-        """The frame in which the map stands now; ``frame`` itself if the buffer does not have that."""
-        parents = {frame.name: frame.parent for frame in self._buffer.frames()}
-        if self._map_frame in parents:
-            return self._map_frame
-        name = self._frame
-        while (parent := parents.get(name)) is not None:
-            name = parent
-        return name
-
-    def problem(self) -> LookupFailed | None:
-        """Why the pose of the laser is not known; None if it is."""
-        try:
-            self._buffer.lookup(self.target, self._frame)
-        except LookupFailed as reason:
-            return reason
-        return None
-
     def read(self, stamp: int) -> Scan | None:
-        """The sweep that ends at ``stamp`` [ns] at the latest; None without newer poses than last time.
-
-        None also if the buffer cannot place all its rays yet. A clock that is set back by more than 1 s, as
-        at the start of each loop of a recording, starts again.
-        """
-        target = self.target
-        if stamp < self._last - _RESTART_NS:
-            self._last = -1
-        try:
-            end = min(stamp, self._newest(target, stamp))
-            first = end - self._laser.sweep_ns
-            if end <= self._last or first < 0:
-                return None
-            stamps = self._laser.stamps(first)
-            poses, valid = self._buffer.lookup_many(target, self._frame, stamps)
-        except LookupFailed:
+        """The sweep that ends at ``stamp`` [ns] at the latest, or None, as ``sweep`` returns it."""
+        sweep = self.sweep(stamp, self._offsets)
+        if sweep is None:
             return None
-        if not valid.all():
-            return None
-        self._last = end
-        self.is_off_map = not self._laser.is_on_map(*poses[-1, :2].tolist())
-        return self._laser.scan_in_space(first, poses)
-
-    def _newest(self, target: str, stamp: int) -> int:
-        try:
-            return self._buffer.latest(target, self._frame)
-        except NoData:
-            if self._buffer.can_lookup(target, self._frame):  # all edges are static
-                return stamp
-            raise
+        self.is_off_map = not self._laser.is_on_map(*sweep.poses[-1, :2].tolist())
+        return self._laser.scan_in_space(sweep.stamp, sweep.poses)
 
 
 def free_distances(is_occupied: NDArray[np.bool_]) -> NDArray[np.int16]:

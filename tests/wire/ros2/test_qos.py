@@ -109,10 +109,12 @@ def test_only_latched_streams_are_transient_local():
     assert latched == {"tf_static", "robot_description", "map"}
 
 
-def test_only_scans_are_best_effort_as_sensor_data_is():
+def test_only_scans_and_clouds_are_best_effort_as_sensor_data_is():
     # rmw_qos_profile_sensor_data
-    assert STREAM_QOS["scan"] == Qos("best_effort", "volatile", "keep_last", 5)
-    assert {qos.reliability for stream, qos in STREAM_QOS.items() if stream != "scan"} == {"reliable"}
+    of_sensors = ("scan", "cloud")
+    assert {STREAM_QOS[stream] for stream in of_sensors} == {Qos("best_effort", "volatile", "keep_last", 5)}
+    others = {qos.reliability for stream, qos in STREAM_QOS.items() if stream not in of_sensors}
+    assert others == {"reliable"}
 
 
 def test_streams_have_the_qos_that_the_wire_specification_lists():

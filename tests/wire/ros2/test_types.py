@@ -20,6 +20,7 @@ from zstate.wire.ros2.types import (
     NAV_SAT_FIX,
     OCCUPANCY_GRID,
     ODOMETRY,
+    POINT_CLOUD2,
     POSE_WITH_COVARIANCE,
     STRING,
     TF_MESSAGE,
@@ -44,6 +45,7 @@ TYPES = (
     FLUID_PRESSURE,
     MAGNETIC_FIELD,
     ODOMETRY,
+    POINT_CLOUD2,
 )
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 

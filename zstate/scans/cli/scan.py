@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
 from zstate.cli import options
 from zstate.cli.metrics import publisher_rows, serve_metrics
-from zstate.cli.output.console import fail, print_status, print_wrapped
+from zstate.cli.output.console import print_status, print_wrapped
 from zstate.cli.output.wire_text import messages_for
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
-    from zstate.net.session import Session
-    from zstate.scans import RangeSource, Scan, SimulatedLaser
+    from zstate.scans import RangeSource, Scan
     from zstate.scans.simulated_laser import MountedLaser
 
 _RATE_HZ = 30.0
@@ -98,11 +98,13 @@ def scan_command(
     zstate scan rrbot --frame lower --dummy --wire ros2    # /scan
     """
     from zstate.cli.commands.publish import run_publisher
+    from zstate.cli.mounted_sensor import Words, mounted_on_robot
     from zstate.scans import ScanPublisher, SimulatedLaser, load_map
     from zstate.scans.simulated_laser import (
         DUMMY_ANGLE_INCREMENT,
         DUMMY_ANGLE_MIN,
         DUMMY_RANGE_MAX,
+        MountedLaser,
     )
     from zstate.wire.keys import check_robot
 
@@ -114,7 +116,19 @@ def scan_command(
     with open_session(network, wires) as session, ExitStack() as opened:
         source: RangeSource = _DummyLaser(frame)
         if laser is not None:
-            source = _mounted_laser(session, laser, robot, frame, map_frame, wires[0], opened, seconds)
+            words = Words("scanner", "scan", "the map")
+            mount, frames = partial(MountedLaser, laser), (frame, map_frame)
+            mounted, place = mounted_on_robot(
+                mount,
+                session,
+                robot,
+                frames=frames,
+                wire=wires[0],
+                seconds=seconds,
+                opened=opened,
+                words=words,
+            )
+            source = _WatchedLaser(mounted, f"{frame} is outside the map, which stands in {place}")
         publisher = ScanPublisher(
             session,
             robot,
@@ -133,42 +147,6 @@ def scan_command(
         places = [f"{one}/{sensor}" if one.startswith("zstate/") else one for one in places]
         print_wrapped(f"{robot}: scans in {frame}, {rate:g} Hz, on {' and on '.join(places)}")
         run_publisher(publisher, source, rate, seconds)
-
-
-def _mounted_laser(  # noqa: PLR0917 - one use, in the order of the options
-    session: Session,
-    laser: SimulatedLaser,
-    robot: str,
-    frame: str,
-    map_frame: str,
-    wire: str,
-    opened: ExitStack,
-    seconds: float | None,
-) -> RangeSource:
-    """``laser`` on the robot, once its pose is known; what is missing is printed."""
-    from zstate.cli.robot_directory import RobotDirectory
-    from zstate.cli.waiting import ConditionWaiter
-    from zstate.nodes.listener import TransformListener
-    from zstate.scans.simulated_laser import MountedLaser
-    from zstate.wire.keys import full_name
-
-    messages, waiter = messages_for(wire), ConditionWaiter()
-    listener = opened.enter_context(TransformListener(session, robot, wire=wire))
-    listener.add_observer(waiter.notify)
-    directory = opened.enter_context(RobotDirectory(session, robot, wire, waiter.notify))
-    owner = messages.robot or robot
-    source = MountedLaser(laser, listener.buffer, full_name(owner, frame), full_name(owner, map_frame))
-
-    def reason() -> str:
-        if not directory.streams(robot):
-            return messages.unknown(robot, directory.robots())
-        return messages.translate(str(source.problem()))
-
-    if not waiter.wait_for(lambda: source.problem() is None, seconds, reason):
-        fail(f"no scan in {seconds:g} s: {reason()}")
-    shown = messages.translate(source.target)
-    print_status(f"simulating a scanner in {frame}; the map stands in {shown}")
-    return _WatchedLaser(source, f"{frame} is outside the map, which stands in {shown}")
 
 
 class _WatchedLaser:

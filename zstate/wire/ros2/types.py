@@ -53,6 +53,19 @@ _FIELDS: dict[str, Fields] = {
         ("float32[]", "ranges"),
         ("float32[]", "intensities"),
     ),
+    "sensor_msgs/PointField": (
+        *(("string", "name"), ("uint32", "offset")),
+        *(("uint8", "datatype"), ("uint32", "count")),
+    ),
+    "sensor_msgs/PointCloud2": (
+        ("std_msgs/Header", "header"),
+        *(("uint32", "height"), ("uint32", "width")),
+        ("sensor_msgs/PointField[]", "fields"),
+        ("bool", "is_bigendian"),
+        *(("uint32", "point_step"), ("uint32", "row_step")),
+        ("uint8[]", "data"),
+        ("bool", "is_dense"),
+    ),
     "nav_msgs/MapMetaData": (
         ("builtin_interfaces/Time", "map_load_time"),
         ("float32", "resolution"),
@@ -128,7 +141,7 @@ _FIELDS: dict[str, Fields] = {
 _NESTED, _ARRAY, _UNBOUNDED_SEQUENCE = 1, 48, 144
 _PRIMITIVES = {
     **{"int8": 2, "uint8": 3, "uint16": 5, "int32": 6, "uint32": 7},
-    **{"float32": 10, "float64": 11, "byte": 16, "string": 17},
+    **{"float32": 10, "float64": 11, "bool": 15, "byte": 16, "string": 17},
 }
 
 _SEPARATOR = "=" * 80
@@ -201,6 +214,7 @@ JOINT_STATE = RosType.from_fields("sensor_msgs/JointState")
 TF_MESSAGE = RosType.from_fields("tf2_msgs/TFMessage")
 STRING = RosType.from_fields("std_msgs/String")
 LASER_SCAN = RosType.from_fields("sensor_msgs/LaserScan")
+POINT_CLOUD2 = RosType.from_fields("sensor_msgs/PointCloud2")
 OCCUPANCY_GRID = RosType.from_fields("nav_msgs/OccupancyGrid")
 CLOCK = RosType.from_fields("rosgraph_msgs/Clock")
 FLOAT64_MULTI_ARRAY = RosType.from_fields("std_msgs/Float64MultiArray")
