@@ -7,7 +7,10 @@ import re
 from collections.abc import Iterator
 from importlib import import_module
 
-MODULES = ("zstate", "zstate.driving", "zstate.odometry", "zstate.scans", "zstate.sources", "zstate.errors")
+MODULES = (
+    *("zstate", "zstate.cameras", "zstate.driving", "zstate.odometry", "zstate.scans", "zstate.sources"),
+    "zstate.errors",
+)
 
 _INTRODUCTION = """# Overview
 

@@ -68,7 +68,10 @@ html_css_files = ["site.css"]
 html_copy_source = False
 
 # The modules whose names are the API.
-PUBLIC = ("zstate", "zstate.driving", "zstate.errors", "zstate.odometry", "zstate.scans", "zstate.sources")
+PUBLIC = (
+    *("zstate", "zstate.cameras", "zstate.driving", "zstate.errors", "zstate.odometry", "zstate.scans"),
+    "zstate.sources",
+)
 
 _ARRAY = r"~?numpy\.ndarray\[tuple\[~?typing\.Any, \.\.\.\], ~?numpy\.dtype\[(~?numpy\.\w+)\]\]"
 

@@ -17,6 +17,7 @@ import pytest
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import JointReading, Kinematics, Recording, Transform, TransformBuffer, Twist
+from zstate.cameras import Camera, Picture
 from zstate.driving import DriverReport, Limits, Outcome, Setpoint
 from zstate.driving.driver_state import Spread
 from zstate.ingest.counters import ListenerStats
@@ -53,7 +54,7 @@ from zstate.scans import Grid, PlacedScan, Scan
 from zstate.sources import WheelPair
 from zstate.wire.identity import WriterId
 
-PUBLIC = ("zstate", "zstate.sources", "zstate.scans", "zstate.driving", "zstate.odometry")
+PUBLIC = ("zstate", "zstate.sources", "zstate.scans", "zstate.cameras", "zstate.driving", "zstate.odometry")
 RRBOT = load_model("rrbot")
 SCRIPT = "<script>alert('x')</script>"
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -91,6 +92,8 @@ def examples() -> list[Any]:
         scan,
         Grid([[0, 100], [-1, 5]], 0.5, (1.0, 2.0, 0.3)),
         PlacedScan(scan, "front", "odom", scan.points(), scan.valid),
+        Camera(64, 48, (60.0, 60.0, 31.5, 23.5)),
+        Picture("front", 5, "arm/lens", "jpeg", b"\xff", (64, 48), None),
         DriverReport(None, spread, spread, spread, 1, 0, {}),
         Limits.of(RRBOT, velocity=1.0, acceleration=2.0),
         Outcome("reached"),

@@ -28,7 +28,18 @@ from zstate.streams import CLOCK, CORE, Stream, StreamName
 GROUP = "zstate.plugins"
 """The group of entry points."""
 
-_BUILT_IN = ("driving", "scans", "odometry", "fleet", "recording", "view", "foxglove", "bridges", "metrics")
+_BUILT_IN = (
+    "driving",
+    "scans",
+    "odometry",
+    "cameras",
+    "fleet",
+    "recording",
+    "view",
+    "foxglove",
+    "bridges",
+    "metrics",
+)
 """The folders of zstate with a module ``plugin``, in the order of the liveliness tokens of their streams."""
 
 _LOG = logging.getLogger("zstate")

@@ -118,6 +118,7 @@ PACK: dict[str, Callable[[Any], bytes]] = {
     "float": lambda value: b"\xcb" + struct.pack(">d", float(value)),
     "bool": lambda value: b"\xc3" if value else b"\xc2",
     "str": pack_str,
+    "bin": lambda value: pack_bin(bytes.fromhex(value)),
     "order": lambda value: pack_bin(bytes.fromhex(value)),
     "str[]": lambda value: pack_array([pack_str(text) for text in value]),
     "edges": lambda value: pack_array([pack_array([pack_str(a), pack_str(b)]) for a, b in value]),
@@ -266,7 +267,11 @@ def test_missing_fields_have_the_defaults_of_the_page_and_nil_is_accepted_where_
 
 
 LARGEST = {"uint": 2**63 - 1, "session": 2**64 - 1, "ns": 2**63 - 1, "stamp": 2**63 - 1}
-NARROWER = {"LaserScan": ("stamp", "ray_ns", "scan_ns"), "OccupancyGrid": ("width", "height")}
+NARROWER = {
+    "LaserScan": ("stamp", "ray_ns", "scan_ns"),
+    "OccupancyGrid": ("width", "height"),
+    "CameraInfo": ("width", "height", "line_time_ns"),
+}
 """Fields with limits that depend on others."""
 
 
