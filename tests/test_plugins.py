@@ -12,7 +12,7 @@ import pytest
 from helpers.cli_runner import run_cli
 from helpers.pages import blocks
 from helpers.plugins import BATTERY_FOLDER, forget_plugins
-from helpers.processes import until
+from helpers.processes import repeated, until
 from helpers.prometheus_text import collected, row
 
 from zstate import StreamListener, StreamPublisher, plugins
@@ -73,6 +73,56 @@ def test_a_stream_is_published_and_received_with_its_name(
         assert (message.stamp, message.voltage, message.charge) == (7, 24.1, 0.8)
         with pytest.raises(SecondWriter, match="already writes battery of 'panda' under the name 'main'"):
             StreamPublisher(reading, "panda", "battery", name="main")
+
+
+LOG = """
+from zstate.plugins import Plugin
+from zstate.streams import StampedMessage, Stream
+
+class Data(StampedMessage, frozen=True, array_like=True, gc=False):
+    data: bytes
+
+ROWS = [Stream(name, Data, max_bytes=3_000_000, bulk=name == "video") for name in ("video", "log")]
+PLUGIN = Plugin("log", streams=tuple(ROWS))
+"""
+
+
+def test_messages_above_1_mb_are_received_on_a_stream_of_bulk_data_only_and_the_newest_8_wait(
+    installed: Path, sessions: tuple[Session, Session]
+):
+    install(installed, "zstate-log", LOG)
+    writing, reading = sessions
+    with (
+        StreamListener(reading, "panda", "video") as videos,
+        StreamListener(reading, "panda", "log") as logs,
+        StreamPublisher(writing, "panda", "video") as video,
+        StreamPublisher(writing, "panda", "log") as log,
+    ):
+        data = bytes(2_000_000)
+        with repeated(lambda: log.publish(data=data), every_s=0.05):
+            until(lambda: logs.refused)
+        with repeated(lambda: video.publish(data=data), every_s=0.05):
+            until(lambda: videos.lost)
+        assert (len(logs), len(videos)) == (0, 8)
+        assert list(logs.refused) == ["too large"]
+        received = videos.get(0.0)
+        assert received is not None
+        assert (len(received.message.data), videos.refused) == (2_000_000, {})
+        with repeated(lambda: video.publish(data=bytes(3_000_001)), every_s=0.05):
+            until(lambda: videos.refused)
+        assert list(videos.refused) == ["too large"]
+    for command in ("hz panda --stream video --once", "echo panda --stream video --once --field stamp", "ls"):
+        with (
+            StreamPublisher(writing, "panda", "video") as video,
+            repeated(lambda publisher=video: publisher.publish(data=data), every_s=0.05),
+        ):
+            ended = run_cli(*command.split())
+            assert ended.code == 0, ended.stderr
+
+
+def test_a_stream_is_not_both_latched_and_of_bulk_data():
+    with pytest.raises(InvalidInput, match="a latched value always arrives, bulk data may not"):
+        Stream("map", "m:Map", latched=True, bulk=True)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ class Message(Struct, frozen=True, array_like=True, gc=False):
     type_name: ClassVar[str] = ""
     """The name in its Zenoh encoding, which is part of the protocol; empty for that of the class."""
     max_bytes: ClassVar[int] = 0
-    """Larger payloads are refused, on whatever key; 0 for the limit of latched values."""
+    """Larger payloads are refused, on whatever key; 0 for the limit of the largest stream."""
 
     @staticmethod
     def pack(payload: bytes) -> bytes:

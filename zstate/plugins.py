@@ -294,6 +294,12 @@ def is_latched(name: StreamName) -> bool:
     return found is not None and found.latched
 
 
+def is_bulk(name: StreamName) -> bool:
+    """Whether the samples of the stream are large, and give way to others."""
+    found = find_stream(name)
+    return found is not None and found.bulk
+
+
 def is_measured(name: StreamName) -> bool:
     """Whether the stream is one of ``measured_streams``, without a search for other packages' otherwise."""
     found = find_stream(name)

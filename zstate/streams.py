@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from zstate.message import Message, StampedMessage
 
 __all__ = [
+    "BULK_BYTES",
     "CLOCK",
     "CORE",
     "GRID_CELLS",
@@ -49,6 +50,8 @@ GRID_CELLS = 16 * 2**20
 """The cells of the largest map."""
 LATCHED_BYTES = GRID_CELLS + 8 * 2**10
 """A grid of ``GRID_CELLS`` takes less on each wire."""
+BULK_BYTES = 64 * MEGABYTE
+"""The largest sample of bulk data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,9 @@ class Stream:
       writer has zstate/<robot>/<name>.
     - ``latched``: it has one current value, which late joiners receive as well.
     - ``max_bytes``: larger payloads are refused. That bounds the memory that a writer can make a reader use.
-      Without ``latched`` they are refused above 1 MB in any case.
+      Without ``latched`` they are refused above 1 MB in any case, with ``bulk`` above 64 MB.
+    - ``bulk``: its samples are large, as clouds and images are, and give way to those of all other streams:
+      Zenoh sends them with a lower priority, and no more than 8 wait for a reader.
     - ``version``: of its messages, in their Zenoh encoding. Fields may be appended within a version.
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
@@ -75,7 +80,7 @@ class Stream:
     - ``ros``: ``"module:name"`` of how ROS 2 carries it (zstate.wire.ros2.streams.RosStream); empty if it
       does not.
 
-    Raises InvalidInput for a name that is none.
+    Raises InvalidInput for a name that is none, and for ``bulk`` with ``latched``.
     """
 
     name: StreamName
@@ -85,6 +90,7 @@ class Stream:
     group: Group = "measurement"
     named: bool = False
     latched: bool = False
+    bulk: bool = False
     max_bytes: int = MEASUREMENT_BYTES
     version: int = 1
     start: str = ""
@@ -99,6 +105,10 @@ class Stream:
             raise InvalidInput(
                 "the name of a stream has lower-case letters, digits and underscores; got "
                 f"{printable(text)!r}"
+            )
+        if self.bulk and self.latched:
+            raise InvalidInput(
+                f"the stream {text!r} is latched and bulk; a latched value always arrives, bulk data may not"
             )
 
     def __repr__(self) -> str:

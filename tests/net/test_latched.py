@@ -306,19 +306,24 @@ def test_values_and_samples_are_sent_as_the_wire_specification_lists():
         opened.enter_context(
             reader.zenoh.declare_subscriber("k/*", lambda one: received.update({str(one.key_expr): one}))
         )
-        sample = opened.enter_context(KeyPublisher(writer, "k/stream", ENCODING))
+        samples = [
+            opened.enter_context(KeyPublisher(writer, "k/stream", ENCODING)),
+            opened.enter_context(KeyPublisher(writer, "k/bulk", ENCODING, is_bulk=True)),
+        ]
         values = [
             opened.enter_context(LatchedPublisher(writer, "k/value", ENCODING)),
             opened.enter_context(LatchedPublisher(writer, "k/large", ENCODING, is_large=True)),
             opened.enter_context(LatchedPublisher(writer, "k/urgent", ENCODING, urgent=True)),
         ]
-        until(lambda: sample.has_readers)
-        sample.put(b"1")
+        until(lambda: all(sample.has_readers for sample in samples))
+        for sample in samples:
+            sample.put(b"1")
         for value in values:
             value.set(b"1")
-        until(lambda: len(received) == 4)
+        until(lambda: len(received) == 5)
         for name, row in (
-            ("stream", "all streams, `status`, `release`"),
+            ("stream", "all streams but those of bulk data, `status`, `release`"),
+            ("bulk", "streams of bulk data"),
             ("value", "`robot_description`, `tf_static`, `map`, `driver`"),
             ("large", "`robot_description`, `tf_static`, `map`, `driver`"),
             ("urgent", "`stop`, `relax`"),

@@ -2,7 +2,7 @@ import threading
 import time
 
 import pytest
-from helpers.processes import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, repeated, until
 
 from zstate.errors import Closed
 from zstate.net.session import connect
@@ -79,6 +79,24 @@ def test_8192_samples_wait_for_a_reader_of_several_keys_and_1024_for_that_of_one
     assert capacity_for(("zstate/*/joint_states",)) == 8192
     assert capacity_for(("zstate/r1/joint_states", "zstate/r2/joint_states")) == 8192
     assert capacity_for(("zstate/r1/joint_states",)) == 1024
+
+
+@pytest.mark.parametrize("key", ["zstate/r1/cloud/front", "zstate/*/cloud/*"])
+def test_8_samples_of_bulk_data_wait_for_a_reader(key: str):
+    assert capacity_for((key,), is_bulk=True) == 8
+
+
+@pytest.mark.parametrize(("is_bulk", "received", "size"), [(False, 1, 16_785_409), (True, 5_000_000, 0)])
+def test_samples_above_1_mb_are_received_as_bulk_data_only(sessions, is_bulk: bool, received: int, size: int):
+    got: list[SerializedSample] = []
+    with (
+        KeyPublisher(sessions[0], KEY, ENCODING, is_bulk=True) as publisher,
+        StreamSubscriber(sessions[1], KEY, got.extend, is_bulk=is_bulk),
+    ):
+        until(lambda: publisher.has_readers)
+        with repeated(lambda: publisher.put(bytes(5_000_000)), every_s=0.05):  # congestion drops some
+            until(lambda: got)
+    assert (len(got[0].payload), got[0].size) == (received, size)
 
 
 def test_slow_reader_receives_the_newest_samples_and_full_batches_are_counted(sessions):

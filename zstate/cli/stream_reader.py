@@ -12,8 +12,9 @@ from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.waiting import ConditionWaiter
 from zstate.clock import LONGEST_WAIT_S
 from zstate.net.presence import announce_reader
-from zstate.net.streams import CAPACITY
+from zstate.net.streams import BULK_CAPACITY, CAPACITY
 from zstate.net.subscription import Received, subscribe
+from zstate.plugins import is_bulk
 from zstate.streams import StreamName
 from zstate.wire.keys import check_robot
 from zstate.wire.messages import Message
@@ -39,6 +40,7 @@ class StreamReader(Closeable):
     def __init__(self, session: Session, robot: str, stream: StreamName, wire: str = "native") -> None:
         self.robot = check_robot(robot)
         self._stream: StreamName = stream
+        self._capacity = BULK_CAPACITY if is_bulk(stream) else CAPACITY
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[TimedSample] = queue.SimpleQueue()
         self._waiter = ConditionWaiter()
@@ -59,7 +61,7 @@ class StreamReader(Closeable):
         now = time.monotonic_ns()
         for _, _, sample in received:
             # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
-            if self._samples.qsize() < CAPACITY:
+            if self._samples.qsize() < self._capacity:
                 self._samples.put(TimedSample(now, sample))
         self._waiter.notify()
 

@@ -30,9 +30,9 @@ from zstate.net.latched import cached_values
 from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.queryable import query
 from zstate.net.session import Session
-from zstate.net.streams import Ring, to_serialized
-from zstate.plugins import edge_streams, is_measured, is_named
-from zstate.streams import StreamName
+from zstate.net.streams import BULK_CAPACITY, Ring, to_serialized
+from zstate.plugins import edge_streams, is_bulk, is_measured, is_named
+from zstate.streams import BULK_BYTES, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import (
     ANY,
@@ -221,7 +221,7 @@ class WriterClaim(Closeable):
         """Whether a sample or a latched value of ``rival`` has been received since the first call."""
         stream = (rival.stream, rival.name)
         if stream not in self._received:
-            ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
+            ring: Ring = zenoh.handlers.RingChannel(BULK_CAPACITY if is_bulk(rival.stream) else CAPACITY)
             has_key = bool(rival.name) or not is_named(rival.stream)
             self._received[stream] = zenoh.ext.declare_advanced_subscriber(
                 self._session.zenoh,
@@ -231,7 +231,8 @@ class WriterClaim(Closeable):
             )
         for sample in islice(iter(self._received[stream].handler.try_recv, None), CAPACITY):
             with suppress(MessageError):  # withdrawn, or not of zstate
-                for message in _WIRE.decode(rival.stream, to_serialized(sample), rival.robot):
+                received = to_serialized(sample, "", BULK_BYTES)
+                for message in _WIRE.decode(rival.stream, received, rival.robot):
                     self._publishing.add(session_of(message))
         self._publishing &= {one.writer.session for one in self._rivals}
         return rival.writer.session in self._publishing

@@ -24,7 +24,7 @@ from zstate._util.closeable import Closeable
 from zstate.errors import Closed
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session, Undeclarable
-from zstate.streams import LATCHED_BYTES, SAMPLE_BYTES
+from zstate.streams import BULK_BYTES, LATCHED_BYTES, SAMPLE_BYTES
 from zstate.wire.messages import ATTACHMENT_BYTES
 from zstate.wire.protocol import NO_ENVELOPE, Envelope, SerializedSample
 
@@ -37,6 +37,9 @@ together and the thread that takes them out waits for longer.
 
 Not more, because a waiting sample holds the memory it was received in, 10 to 20 kB.
 """
+
+BULK_CAPACITY = 8
+"""The same for streams of bulk data, whatever their keys: as large as they may be, 512 MB."""
 
 _MAX_KEYS = 4096
 
@@ -193,8 +196,10 @@ class Receiver(Closeable):
             threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
 
 
-def capacity_for(keyexprs: Sequence[str]) -> int:
+def capacity_for(keyexprs: Sequence[str], *, is_bulk: bool = False) -> int:
     """The number of samples of ``keyexprs`` that wait for their reader; beyond it the oldest are lost."""
+    if is_bulk:
+        return BULK_CAPACITY
     return WILDCARD_CAPACITY if len(keyexprs) > 1 or "*" in keyexprs[0] else CAPACITY
 
 
@@ -206,22 +211,26 @@ def to_serialized(sample: zenoh.Sample, key: str = "", max_bytes: int = LATCHED_
     payload, attachment, encoding = sample.payload, sample.attachment, str(sample.encoding)
     key = key or str(sample.key_expr)
     if len(payload) > max_bytes or (attachment is not None and len(attachment) > ATTACHMENT_BYTES):
-        return SerializedSample(key, b"\0", encoding, None, max(len(payload), LATCHED_BYTES + 1))
+        size = max(len(payload), LATCHED_BYTES + 1, max_bytes + 1)  # more than any stream here may have
+        return SerializedSample(key, b"\0", encoding, None, size)
     attached = None if attachment is None else attachment.to_bytes()
     return SerializedSample(key, payload.to_bytes(), encoding, attached)
 
 
 class KeyPublisher(Closeable):
-    """Publisher of samples on one key. Under congestion samples are dropped; the writer is never delayed."""
+    """Publisher of samples on one key. Under congestion samples are dropped; the writer is never delayed.
 
-    def __init__(self, session: Session, key: str, encoding: str) -> None:
+    Those of a publisher that ``is_bulk`` wait in the queues of Zenoh until all others are sent.
+    """
+
+    def __init__(self, session: Session, key: str, encoding: str, *, is_bulk: bool = False) -> None:
         self._session = session
         self._key = key
         self._publisher = session.zenoh.declare_publisher(
             key,
             encoding=encoding or None,
             congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            priority=zenoh.Priority.DATA_LOW if is_bulk else zenoh.Priority.INTERACTIVE_HIGH,
             express=False,
         )
         self.zenoh_put: Callable[..., object] = self._publisher.put  # pyright: ignore  # its result has no type
@@ -269,6 +278,8 @@ class StreamSubscriber(Receiver):
     handled the sample: then ``on_samples`` does not get it. ``message`` is the payload with the attachment
     behind it, None in another envelope than ``envelope``. Samples of a full batch go to ``on_samples`` only.
 
+    A subscriber that ``is_bulk`` receives samples of up to 64 MB, others of up to 1 MB, and fewer wait.
+
     The keys of received samples, up to 4096, are declared to Zenoh, which keeps the route of samples on
     declared keys. On others it searches all declarations under them for each sample: with the tokens of 100
     robots that is a quarter of what a reader's sample costs. A declaration takes up to 5 ms while the tokens
@@ -285,6 +296,7 @@ class StreamSubscriber(Receiver):
         insert_next: Callable[[str, bytes | None], bool] | None = None,
         envelope: Envelope = NO_ENVELOPE,
         is_dormant: bool = False,
+        is_bulk: bool = False,
     ) -> None:
         keyexprs = (keyexprs,) if isinstance(keyexprs, str) else keyexprs
         self._key = "" if len(keyexprs) > 1 or "*" in keyexprs[0] else keyexprs[0]
@@ -298,7 +310,8 @@ class StreamSubscriber(Receiver):
         self._needs_batches = not self._key or envelope.attachment_bytes > 0
         self._encoding = zenoh.Encoding(envelope.encoding)
         self._attachment_bytes = envelope.attachment_bytes
-        capacity = capacity or capacity_for(keyexprs)
+        self._max_bytes = BULK_BYTES if is_bulk else 4 * SAMPLE_BYTES
+        capacity = capacity or capacity_for(keyexprs, is_bulk=is_bulk)
         declare = session.zenoh.declare_subscriber
         super().__init__(session, keyexprs, declare, capacity, is_dormant=is_dormant)
 
@@ -324,7 +337,7 @@ class StreamSubscriber(Receiver):
     def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         if self._insert_next is not None and len(batch) < self._capacity:
             batch = [sample for sample in batch if not self._is_handled(sample)]
-        samples = [to_serialized(sample, self._key, 4 * SAMPLE_BYTES) for sample in batch]
+        samples = [to_serialized(sample, self._key, self._max_bytes) for sample in batch]
         if not all(sample.payload for sample in samples):
             # A delete has no payload; reading the kind of every sample would cost as much as its key.
             puts = zenoh.SampleKind.PUT

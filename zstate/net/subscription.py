@@ -9,7 +9,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.plugins import is_latched
+from zstate.plugins import is_bulk, is_latched
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY, shortened
 from zstate.wire.messages import Message
@@ -89,4 +89,4 @@ def subscribe(
     keys = [wire.expression(one, stream, name) for one in names]
     if is_latched(stream):
         return LatchedSubscriber(session, keys, on_value)
-    return StreamSubscriber(session, keys, on_samples)
+    return StreamSubscriber(session, keys, on_samples, is_bulk=is_bulk(stream))

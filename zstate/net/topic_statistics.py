@@ -23,6 +23,7 @@ from zstate.clock import Clock, SystemClock
 from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
+from zstate.plugins import is_bulk
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY
 from zstate.wire.messages import StampedMessage
@@ -219,7 +220,7 @@ class TopicStatistics(Closeable):
                 self._arrived.notify_all()
 
         key = self._wire.expression(robot, stream)
-        subscriber = StreamSubscriber(self._session, key, on_samples)
+        subscriber = StreamSubscriber(self._session, key, on_samples, is_bulk=is_bulk(stream))
         self._subscribers.append(self._subscriptions.enter_context(subscriber))
 
     @property

@@ -19,7 +19,7 @@ from zstate.net.presence import announce
 from zstate.net.queryable import query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
-from zstate.plugins import stream_named
+from zstate.plugins import is_bulk, stream_named
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
@@ -42,8 +42,8 @@ class SampleWriter(KeyPublisher):
     sent on none: encode for all of them first.
     """
 
-    def __init__(self, session: Session, encoder: StreamEncoder) -> None:
-        super().__init__(session, encoder.key, encoder.encoding)
+    def __init__(self, session: Session, encoder: StreamEncoder, *, is_bulk: bool = False) -> None:
+        super().__init__(session, encoder.key, encoder.encoding, is_bulk=is_bulk)
         self.encoder = encoder
         self.publish_path: PublishPath | None = None
         """The extension's publisher of this writer's usual samples, which counts them; None without it."""
@@ -120,7 +120,8 @@ class WireWriter(Closeable):
 
     def open_stream(self, stream: StreamName, name: str = "") -> SampleWriter:
         """Open and announce ``stream``; edges under ``name``."""
-        return self._announced(SampleWriter(self._session, self._encoder(stream, name)))
+        encoder = self._encoder(stream, name)
+        return self._announced(SampleWriter(self._session, encoder, is_bulk=is_bulk(stream)))
 
     def open_latched(self, stream: StreamName, name: str = "") -> LatchedWriter:
         """Open and announce ``stream`` for a latched value; static edges under ``name``."""

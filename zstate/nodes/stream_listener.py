@@ -12,6 +12,7 @@ from zstate._util.inbox import Inbox
 from zstate._util.refusals import Refusals
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
+from zstate.net.streams import BULK_CAPACITY
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.stream_publisher import checked_stream
 from zstate.streams import Stream
@@ -39,8 +40,8 @@ class StreamListener(Closeable):
 
     ``for received in listener`` and ``async for received in listener`` return each message once, in the
     order of arrival, and end with ``close()``; ``get`` returns the next one. Of more than 4096 unread
-    messages the oldest are lost, and counted in ``lost``. ``refused`` counts payloads that are no message of
-    the stream, by reason; the first of each reason is also logged. A context manager.
+    messages, 8 of bulk data, the oldest are lost, and counted in ``lost``. ``refused`` counts payloads that
+    are no message of the stream, by reason; the first of each reason is also logged. A context manager.
 
     Raises InvalidInput for a stream that no installed package brings, or that ``wire`` does not carry.
     """
@@ -53,7 +54,8 @@ class StreamListener(Closeable):
         self._wire = get_wire(wire)
         self._refusals = Refusals(self.stream.name)
         self.refused: dict[str, int] = self._refusals.counts
-        self._unread: Inbox[ReceivedMessage] = Inbox(_CAPACITY, session.check)
+        capacity = BULK_CAPACITY if self.stream.bulk else _CAPACITY
+        self._unread: Inbox[ReceivedMessage] = Inbox(capacity, session.check)
         robots = selected_robots(robot, self._wire)
         with ExitStack() as opening:
             opening.enter_context(

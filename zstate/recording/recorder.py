@@ -26,7 +26,7 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.plugins import edge_streams, is_latched, is_named, latched_streams, measured_streams
+from zstate.plugins import edge_streams, is_bulk, is_latched, is_named, latched_streams, measured_streams
 from zstate.rate import Rate
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
@@ -45,6 +45,8 @@ FLUSH_NS = 500_000_000
 QUEUE_BYTES = 64 * 2**20
 QUEUE_LENGTH = 8192
 """Samples that wait in the queue; more wait in the rings of the subscriptions, which drop the oldest."""
+BULK_QUEUE_BYTES = QUEUE_BYTES // 2
+"""Bulk data waits for room in this part of the queue, so that other samples have the rest."""
 
 LARGE_BYTES = 1 << 16
 """Latched values from this size on are decoded and encoded in a thread of their own."""
@@ -93,14 +95,16 @@ class MessageQueue(Closeable):
         An empty payload of a latched stream is a withdrawn value.
         """
         self.unsubscribe(stream)
-        capacity = capacity_for(expressions)
+        has_bulk = is_bulk(stream)
+        capacity = capacity_for(expressions, is_bulk=has_bulk)
+        max_bytes = BULK_QUEUE_BYTES if has_bulk else QUEUE_BYTES
 
         def put(arrivals: list[SerializedSample]) -> None:
             batch = Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity)
             with self._has_room:
                 # A slow reader must not fill the memory: the subscription's ring drops samples, and counts
                 # them.
-                while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= QUEUE_BYTES):
+                while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= max_bytes):
                     self._has_room.wait()
                 if self._is_open:
                     self._batches.append(batch)
@@ -111,7 +115,7 @@ class MessageQueue(Closeable):
         if is_latched(stream):
             subscriber = LatchedSubscriber(self._session, expressions, lambda arrival: put([arrival]))
         else:
-            subscriber = StreamSubscriber(self._session, expressions, put)
+            subscriber = StreamSubscriber(self._session, expressions, put, is_bulk=has_bulk)
         self._subscribers[stream] = subscriber
 
     def unsubscribe(self, stream: StreamName) -> None:

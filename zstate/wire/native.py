@@ -15,7 +15,7 @@ import msgspec
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.plugins import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
-from zstate.streams import LATCHED_BYTES, Stream, StreamName
+from zstate.streams import BULK_BYTES, Stream, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import (
@@ -99,7 +99,7 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """
     if encoding != encoding_of(kind):
         raise _foreign_error(encoding, kind)
-    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > (kind.max_bytes or LATCHED_BYTES):
+    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > (kind.max_bytes or BULK_BYTES):
         raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
     try:
         return _DECODERS[kind].decode(kind.unpack(payload))  # type: ignore[return-value]  # one decoder per type
