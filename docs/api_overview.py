@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from importlib import import_module
 
 MODULES = (
-    *("zstate", "zstate.driving", "zstate.odometry", "zstate.scans", "zstate.clouds"),
+    *("zstate", "zstate.driving", "zstate.odometry", "zstate.scans", "zstate.clouds", "zstate.cameras"),
     *("zstate.sources", "zstate.errors"),
 )
 

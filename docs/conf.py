@@ -69,7 +69,7 @@ html_copy_source = False
 
 # The modules whose names are the API.
 PUBLIC = (
-    *("zstate", "zstate.clouds", "zstate.driving", "zstate.errors"),
+    *("zstate", "zstate.cameras", "zstate.clouds", "zstate.driving", "zstate.errors"),
     *("zstate.odometry", "zstate.scans", "zstate.sources"),
 )
 

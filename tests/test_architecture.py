@@ -76,6 +76,8 @@ HOMES = {
     "tf2_msgs": "bridges",
     "prometheus_client": "metrics",
     "pygeomag": "odometry",
+    "av": "cameras",
+    "simplejpeg": "cameras",
     "viser": "view",
     "websockets": "foxglove",
     "trimesh": "view",

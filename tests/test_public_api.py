@@ -92,6 +92,7 @@ SIGNATURES = {
     "TransformBuffer.lookup_between": "(target, target_at, source, source_at, fixed)",
     "TransformBuffer.lookup_many": "(target, source, stamps)",
     "TransformBuffer.place": "(points, stamps, source, target)",
+    "TransformBuffer.project": "(points, frame, camera, stamp)",
     "TransformBuffer.plan": "(target, source)",
     "TransformBuffer.twist": "(frame, reference, at=None)",
     "TransformBuffer.can_lookup": "(target, source, at=None)",

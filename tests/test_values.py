@@ -17,6 +17,7 @@ import pytest
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import JointReading, Kinematics, Recording, Transform, TransformBuffer, Twist
+from zstate.cameras import Camera, Picture
 from zstate.clouds import Cloud, PlacedCloud
 from zstate.driving import DriverReport, Limits, Outcome, Setpoint
 from zstate.driving.driver_state import Spread
@@ -54,7 +55,17 @@ from zstate.scans import Grid, PlacedScan, Scan
 from zstate.sources import WheelPair
 from zstate.wire.identity import WriterId
 
-PUBLIC = ("zstate", "zstate.sources", "zstate.scans", "zstate.clouds", "zstate.driving", "zstate.odometry")
+PUBLIC = (
+    "zstate",
+    *(
+        "zstate.sources",
+        "zstate.scans",
+        "zstate.clouds",
+        "zstate.cameras",
+        "zstate.driving",
+        "zstate.odometry",
+    ),
+)
 RRBOT = load_model("rrbot")
 SCRIPT = "<script>alert('x')</script>"
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -95,6 +106,8 @@ def examples() -> list[Any]:
         PlacedScan(scan, "front", "odom", scan.points(), scan.valid),
         cloud,
         PlacedCloud(cloud, "front", "odom", cloud.xyz.copy(), cloud.valid),
+        Camera(64, 48, (60.0, 60.0, 31.5, 23.5)),
+        Picture("front", 5, "arm/lens", "jpeg", b"\xff", (64, 48), None),
         DriverReport(None, spread, spread, spread, 1, 0, {}),
         Limits.of(RRBOT, velocity=1.0, acceleration=2.0),
         Outcome("reached"),

@@ -33,6 +33,7 @@ _BUILT_IN = (
     "scans",
     "odometry",
     "clouds",
+    "cameras",
     "fleet",
     "recording",
     "view",

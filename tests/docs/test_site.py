@@ -17,7 +17,17 @@ import pytest
 from zstate.cli.main import group
 
 ROOT = Path(__file__).parents[2]
-PUBLIC = ["zstate", "zstate.clouds", "zstate.driving", "zstate.odometry", "zstate.scans", "zstate.sources"]
+PUBLIC = [
+    "zstate",
+    *(
+        "zstate.cameras",
+        "zstate.clouds",
+        "zstate.driving",
+        "zstate.odometry",
+        "zstate.scans",
+        "zstate.sources",
+    ),
+]
 
 # What a browser loads by itself; an address in <a href> is loaded by a click.
 LOADED = {

@@ -323,9 +323,9 @@ def test_values_and_samples_are_sent_as_the_wire_specification_lists():
         until(lambda: len(received) == 5)
         for name, row in (
             ("stream", "all streams but those of bulk data, `status`, `release`"),
-            ("bulk", "streams of bulk data: `cloud`"),
-            ("value", "`robot_description`, `tf_static`, `map`, `driver`"),
-            ("large", "`robot_description`, `tf_static`, `map`, `driver`"),
+            ("bulk", "streams of bulk data: `cloud`, `image`"),
+            ("value", "`robot_description`, `tf_static`, `map`, `camera_info`, `driver`"),
+            ("large", "`robot_description`, `tf_static`, `map`, `camera_info`, `driver`"),
             ("urgent", "`stop`, `relax`"),
         ):
             one = received[f"k/{name}"]

@@ -119,9 +119,9 @@ PACK: dict[str, Callable[[Any], bytes]] = {
     "float": lambda value: b"\xcb" + struct.pack(">d", float(value)),
     "bool": lambda value: b"\xc3" if value else b"\xc2",
     "str": pack_str,
+    "bin": lambda value: pack_bin(bytes.fromhex(value)),
     "order": lambda value: pack_bin(bytes.fromhex(value)),
     "str[]": lambda value: pack_array([pack_str(text) for text in value]),
-    "bin": lambda value: pack_bin(bytes.fromhex(value)),
     "fields": lambda value: pack_array(
         [pack_array([pack_str(one[0]), *(pack_int(number) for number in one[1:])]) for one in value]
     ),
@@ -276,6 +276,7 @@ NARROWER = {
     "LaserScan": ("stamp", "ray_ns", "scan_ns"),
     "OccupancyGrid": ("width", "height"),
     "PointCloud": ("height", "width", "point_step", "row_step"),
+    "CameraInfo": ("width", "height", "line_time_ns"),
 }
 """Fields with limits that depend on others."""
 

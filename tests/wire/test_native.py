@@ -9,6 +9,7 @@ from helpers.message_types import MESSAGE_TYPES
 from hypothesis import given
 from hypothesis import strategies as st
 
+from zstate.cameras.messages import CameraInfo, CompressedImage
 from zstate.clouds.messages import PointCloud, PointField
 from zstate.driving.messages import (
     DriverState,
@@ -64,6 +65,8 @@ NAMES = ("j1", "j2")
 ORDER = order_digest(NAMES)
 EDGES = (("b", "a"), ("a", "h"))
 STAMP = 1_700_000_000_123_456_789
+
+PACKET = b"\x00\x00\x01\x65\x88"  # of H.264: a start code, and the begin of a key frame
 
 # MessagePack, by its specification: 0x90|n fixarray, 0xcf uint64, 0xcd uint16, 0xc4 n bin8,
 # 0xa0|n fixstr, 0xc0 nil, 0x00..0x7f positive fixint; integers are big-endian.
@@ -232,6 +235,23 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"".join(b"\xcb" + struct.pack(">d", number) for number in (0.125, 8.0))
         + bin8(struct.pack("<2f", 0.5, np.inf))
         + bin8(struct.pack("<2f", 1, 2)),
+    ),
+    "image": (
+        CompressedImage(STAMP, 300, 2**63 + 5, "wrist", "h264", PACKET),
+        header(6)[:-10] + fixstr("wrist") + fixstr("h264") + bin8(PACKET),
+    ),
+    "camera_info": (
+        CameraInfo(
+            *(STAMP, 300, 2**63 + 5, "wrist", 100, 50, "equidistant"),
+            *(to_block([80, 81, 49.5, 24.5]), to_block([0.5, 0, 0, 0]), 7),
+        ),
+        header(12)[:-10]
+        + fixstr("wrist")
+        + b"\x64\x32"
+        + fixstr("equidistant")
+        + bin8(struct.pack("<4d", 80, 81, 49.5, 24.5))
+        + bin8(struct.pack("<4d", 0.5, 0, 0, 0))
+        + b"\x07\xc0\xc0",
     ),
     "imu": (
         Imu(

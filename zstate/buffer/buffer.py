@@ -20,6 +20,7 @@ from zstate.buffer.core import BufferCore
 from zstate.buffer.feed import BufferFeed
 from zstate.buffer.history import HistoryView
 from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
+from zstate.buffer.projection import ProjectingCamera, project_rows
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.tracks import JointTrack, TimeSpan, Track
 from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
@@ -200,6 +201,28 @@ class TransformBuffer(BufferCore):
         path = self._path(target, source)
         array = check_points(points)
         return path.place(array, check_stamps_of_points(stamps, len(array)))
+
+    def project(
+        self, points: ArrayLike, frame: str, camera: ProjectingCamera, stamp: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """``points`` of ``frame`` in a picture of ``camera``: pixels (N, 2), and which are valid: (N,).
+
+        ``points`` are (N, 3) x y z [m], pixels u v as ``camera.project`` defines them. ``stamp`` [ns] is that
+        of the picture, the instant of its first row. If the camera has a ``line_time_ns``, each point is
+        taken at the instant of the row in which it appears, also if ``frame`` moves::
+
+            pixels, valid = buffer.project([[0.0, 0.0, 0.0]], "hand", picture.camera, picture.stamp)
+
+        Points that the camera does not see, without a transform at their instant, or that are not finite,
+        are NaN and not valid. Raises as ``place`` does.
+        """
+        path = self._path(camera.frame, frame)
+        array = check_points(points).astype(np.float64, copy=False)  # as float32 it would be 1e-4 px
+
+        def place(stamps: NDArray[np.int64]) -> tuple[Points, NDArray[np.bool_]]:
+            return path.place(array, stamps)
+
+        return project_rows(place, camera, check_stamp(stamp), len(array))
 
     def plan(self, target: str, source: str) -> Plan:
         """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""

@@ -29,11 +29,13 @@ def decode_samples(
     robot: str,
     stream: StreamName,
     samples: Iterable[SerializedSample],
+    *,
     on_error: Callable[[str, str], object] | None = None,
+    on_refused: Callable[[str], object] | None = None,
 ) -> Iterator[Received]:
     """The messages of ``samples`` of ``robot``, or of the robot of each key with ``"*"``.
 
-    ``on_error(reason, text)`` is called for each payload that cannot be decoded.
+    ``on_error(reason, text)`` and ``on_refused(key)`` are called for each payload that cannot be decoded.
     """
     for sample in samples:
         try:
@@ -44,6 +46,8 @@ def decode_samples(
             if on_error is not None:
                 reason = error.reason if isinstance(error, MessageError) else "foreign"
                 on_error(reason, f"{shortened(sample.key)}: {error}")
+            if on_refused is not None:
+                on_refused(sample.key)
 
 
 def subscribe(
@@ -53,20 +57,26 @@ def subscribe(
     stream: StreamName,
     on_messages: Callable[[list[Received]], object],
     *,
+    name: str = ANY,
     on_error: Callable[[str, str], object] | None = None,
     on_withdrawn: Callable[[str], object] | None = None,
+    on_refused: Callable[[str], object] | None = None,
 ) -> StreamSubscriber | LatchedSubscriber:
     """Subscribe to ``stream`` of a robot, of several, or of all robots with ``"*"``: with the same threads.
 
+    ``name`` selects one writer of a stream whose writers have names.
+
     ``on_messages`` is called from one thread of the subscription with the messages of each batch, oldest
-    first; ``on_error(reason, text)`` for each payload that cannot be decoded; ``on_withdrawn(key)`` if a
-    latched value is withdrawn.
+    first; ``on_error(reason, text)`` and ``on_refused(key)`` for each payload that cannot be decoded;
+    ``on_withdrawn(key)`` if a latched value is withdrawn.
     """
     names = (robots,) if isinstance(robots, str) else robots
     robot = names[0] if len(names) == 1 else ANY
 
     def on_samples(samples: Sequence[SerializedSample]) -> None:
-        if messages := list(decode_samples(wire, robot, stream, samples, on_error)):
+        if messages := list(
+            decode_samples(wire, robot, stream, samples, on_error=on_error, on_refused=on_refused)
+        ):
             on_messages(messages)
 
     def on_value(sample: SerializedSample) -> None:
@@ -76,7 +86,7 @@ def subscribe(
         elif on_withdrawn is not None:
             on_withdrawn(sample.key)
 
-    keys = [wire.expression(name, stream) for name in names]
+    keys = [wire.expression(one, stream, name) for one in names]
     if is_latched(stream):
         return LatchedSubscriber(session, keys, on_value)
     return StreamSubscriber(session, keys, on_samples, is_bulk=is_bulk(stream))

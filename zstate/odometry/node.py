@@ -332,7 +332,7 @@ class OdometryNode(Closeable):
         """Agree with others on the datum of a map that is not the robot's own. Raises InvalidInput."""
         wire = get_wire("native")
         cached = cached_values(session, wire.expression(ANY, "datum"), _CACHED_WITHIN_S)
-        for received in decode_samples(wire, ANY, "datum", tuple(cached), self._refusals.count):
+        for received in decode_samples(wire, ANY, "datum", tuple(cached), on_error=self._refusals.count):
             self._agree(received)
         opening.enter_context(
             subscribe(

@@ -31,8 +31,14 @@ from zstate.wire.messages import (
 )
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.streams import has_named_topics, has_sensor_topics, recorded_forms, ros_streams
-from zstate.wire.ros2.topics import SHARED, FrameNames, robot_from_topic
+from zstate.wire.ros2.streams import (
+    has_named_topics,
+    has_sensor_topics,
+    recorded_forms,
+    ros_streams,
+    without_suffix,
+)
+from zstate.wire.ros2.topics import SHARED, FrameNames, name_from_topic, robot_from_topic
 
 _TOPICS: tuple[StreamName, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 STREAMS: tuple[StreamName, ...] = (*_TOPICS, *TOPICS)
@@ -91,7 +97,7 @@ class RecordedWriter:
         "ros".
         """
         stream: StreamName = "transforms"
-        name, facts = channel.topic.rpartition("/")[2], channel.metadata
+        name, facts = name_from_topic(channel.topic), channel.metadata
         foreign = _SESSION not in facts
         if channel.encoding == JSON:
             stream = facts[STREAM]
@@ -133,7 +139,7 @@ def _stream_of_form(topic: str, type_name: str) -> StreamName | None:
 
 def _sensor_from_topic(topic: str, robots: Collection[str]) -> tuple[str, str]:
     """The robot of ``topic``: the last of its namespaces that is one of ``robots``; and the name below it."""
-    tokens = topic.strip("/").split("/")
+    tokens = without_suffix(topic).strip("/").split("/")
     for place in range(len(tokens) - 2, -1, -1):
         if tokens[place] in robots:
             return tokens[place], "_".join(tokens[place + 1 :])

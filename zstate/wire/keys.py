@@ -278,12 +278,12 @@ def stream_from_key(key: str) -> StreamName:
     raise _form_error(key, "zstate/<robot>/<stream>")
 
 
-def stream_expression(robot: str, stream: StreamName) -> str:
-    """The key expression of every writer of ``stream``."""
+def stream_expression(robot: str, stream: StreamName, name: str = ANY) -> str:
+    """The key expression of every writer of ``stream``, or of the one called ``name``."""
     if stream == "clock":
         return CLOCK_KEY
     key = f"zstate/{_check_robot_or_any(robot)}/{stream}"
-    return f"{key}/*" if is_named(stream) else key
+    return f"{key}/{name}" if is_named(stream) else key
 
 
 @lru_cache(4096)  # called for each received sample

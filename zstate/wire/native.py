@@ -104,6 +104,8 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     try:
         return _DECODERS[kind].decode(kind.unpack(payload))  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        if isinstance(error.__cause__, MessageError):  # of the message's own check
+            raise error.__cause__ from None
         # msgspec raises one exception for both; only the texts differ
         if type(error) is msgspec.DecodeError and "truncated" in str(error):
             text = f"a {_type_name(kind)} cut off after {len(payload)} bytes"
@@ -184,8 +186,8 @@ class NativeWire:
         others = [[stream] for stream in streams if not is_own(stream)]
         return tuple(keys.READER_TOKEN.key(robot, one, identity) for one in (own, *others) if one)
 
-    def expression(self, robot: str, stream: StreamName) -> str:
-        return keys.stream_expression(robot, stream)
+    def expression(self, robot: str, stream: StreamName, name: str = keys.ANY) -> str:
+        return keys.stream_expression(robot, stream, name)
 
     robot_from_key = staticmethod(keys.robot_from_key)
 

@@ -159,8 +159,11 @@ class Wire(WriterTokens, Protocol):
         """
         ...
 
-    def expression(self, robot: str, stream: StreamName) -> str:
-        """The key expression of ``stream`` from all writers of ``robot``, or of all robots for ``"*"``."""
+    def expression(self, robot: str, stream: StreamName, name: str = ANY) -> str:
+        """The key expression of ``stream`` from all writers of ``robot``, or of all robots for ``"*"``.
+
+        ``name`` selects one writer of a stream whose writers have names.
+        """
         ...
 
     def robot_from_key(self, key: str) -> str:

@@ -106,15 +106,15 @@ def test_a_recording_names_the_same_qos_to_rosbags(qos: Qos):
 
 def test_only_latched_streams_are_transient_local():
     latched = {stream for stream, qos in STREAM_QOS.items() if qos.durability == "transient_local"}
-    assert latched == {"tf_static", "robot_description", "map"}
+    assert latched == {"tf_static", "robot_description", "map", "camera_info"}
 
 
-def test_only_scans_and_clouds_are_best_effort_as_sensor_data_is():
+def test_only_scans_clouds_and_pictures_are_best_effort_as_sensor_data_is():
     # rmw_qos_profile_sensor_data
-    of_sensors = ("scan", "cloud")
-    assert {STREAM_QOS[stream] for stream in of_sensors} == {Qos("best_effort", "volatile", "keep_last", 5)}
-    others = {qos.reliability for stream, qos in STREAM_QOS.items() if stream not in of_sensors}
-    assert others == {"reliable"}
+    best_effort = {stream: qos for stream, qos in STREAM_QOS.items() if qos.reliability == "best_effort"}
+    assert best_effort == dict.fromkeys(
+        ("scan", "cloud", "image"), Qos("best_effort", "volatile", "keep_last", 5)
+    )
 
 
 def test_streams_have_the_qos_that_the_wire_specification_lists():

@@ -23,10 +23,11 @@ class RosStream(NamedTuple):
     Topics with ``is_named`` have the name of the sensor, or of the writer, and are found by their type.
     ``encode(message, names)`` makes the payload of a message, ``decode(payload, session, seq, names)`` the
     message in one, with the frames as ``names`` has them (FrameNames); those of the streams of the core are
-    in ``RosStreamEncoder`` and ``RosDecoder``. With ``is_of_sensor`` their namespace may be that of the
-    sensor: /r1/imu/data is a topic of the robot r1. ``uncarried`` is the field with a frame that ROS does not
-    carry: a recording has a channel for each. ``withdrawn`` is recorded when a latched value is withdrawn,
-    which ROS cannot express; ``is_withdrawn`` whether a message is such a one.
+    in ``RosStreamEncoder`` and ``RosDecoder``. ``suffix`` are the last names of a topic below that of the
+    sensor, as cameras have them: /r1/wrist/camera_info. With ``is_of_sensor`` their namespace may be that of
+    the sensor: /r1/imu/data is a topic of the robot r1. ``uncarried`` is the field with a frame that ROS does
+    not carry: a recording has a channel for each. ``withdrawn`` is recorded when a latched value is
+    withdrawn, which ROS cannot express; ``is_withdrawn`` whether a message is such a one.
     """
 
     type: RosType
@@ -35,6 +36,7 @@ class RosStream(NamedTuple):
     encode: Callable[..., bytes] | None = None
     decode: Callable[..., Message] | None = None
     is_of_sensor: bool = False
+    suffix: str = ""
     uncarried: str = ""
     withdrawn: Message | None = None
     is_withdrawn: Callable[..., bool] | None = None
@@ -122,10 +124,26 @@ def has_sensor_topics(stream: StreamName) -> bool:
     return carried is not None and carried.is_of_sensor
 
 
+def topic_suffix(stream: StreamName) -> str:
+    """What follows the name of a sensor in the topics of the stream: "/" and names, or nothing."""
+    carried = ros_streams().get(stream)
+    return f"/{carried.suffix}" if carried is not None and carried.suffix else ""
+
+
+def without_suffix(topic: str) -> str:
+    """``topic`` up to the name of its sensor."""
+    for stream in ros_streams():
+        if (suffix := topic_suffix(stream)) and topic.endswith(suffix):
+            return topic.removesuffix(suffix)
+    return topic
+
+
 def topic_stream(topic: str, dds_type: str) -> StreamName | None:
     """The stream that ``topic`` carries by its type and its last name; None if it is none."""
     last_name = topic.rpartition("/")[2]
     for stream, carried in ros_streams().items():
+        if not topic.endswith(topic_suffix(stream)):
+            continue
         if dds_type == carried.type.dds and (carried.is_named or last_name == stream):
             return stream
     return None

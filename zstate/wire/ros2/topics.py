@@ -9,11 +9,14 @@ joint_states         sensor_msgs/JointState                    ``/r1/joint_state
 robot_description    std_msgs/String                           ``/r1/robot_description``
 tf, tf_static        tf2_msgs/TFMessage                        ``/tf``; ``/r1/tf`` with ``tf=namespace``
 scan                 sensor_msgs/LaserScan                     ``/r1/<sensor>``, such as ``/r1/scan``
+image                sensor_msgs/CompressedImage               ``/r1/<camera>/image_raw/compressed``
+camera_info          sensor_msgs/CameraInfo                    ``/r1/<camera>/camera_info``
 others of sensors    that of their row (``RosStream.type``)    likewise
 clock                rosgraph_msgs/Clock                       ``/clock``
 ===================  ========================================  ===========================================
 
-The topics with a name of a sensor, or of a writer, are found by their type, whatever their last name is.
+The topics with a name of a sensor, or of a writer, are found by their type, whatever their last name is;
+those of cameras by their last names as well, as image_transport has them.
 """
 
 from __future__ import annotations
@@ -26,7 +29,13 @@ from zstate.streams import StreamName
 from zstate.wire.keys import ANY, wire_name
 from zstate.wire.messages import Edges
 from zstate.wire.ros2.options import Ros2Options, check_token
-from zstate.wire.ros2.streams import has_named_topics, ros_streams, ros_type
+from zstate.wire.ros2.streams import (
+    has_named_topics,
+    ros_type,
+    topic_stream,
+    topic_suffix,
+    without_suffix,
+)
 
 SHARED = "ros"
 """The robot of topics in the root namespace, and of frames that belong to no robot."""
@@ -62,12 +71,12 @@ class RmwKeys:
         type_hash = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
         return f"{self._options.domain}{self.topic(robot, stream, name)}/{kind.dds}/{type_hash}"
 
-    def expression(self, robot: str, stream: StreamName) -> str:
+    def expression(self, robot: str, stream: StreamName, name: str = ANY) -> str:
         """The key expression of ``stream``; robot ``"*"`` means all robots in the namespace.
 
-        With ``namespace=*`` these are all robots in a namespace of one token.
+        With ``namespace=*`` these are all robots in a namespace of one token. ``name`` selects one sensor.
         """
-        last_name = ANY if has_named_topics(stream) else stream
+        last_name = name if has_named_topics(stream) else stream
         return (
             f"{self._options.domain}{self._topic_pattern(robot, stream, last_name)}/{ros_type(stream).dds}/*"
         )
@@ -77,13 +86,14 @@ class RmwKeys:
 
         Raises InvalidInput for a key that is not of this layout.
         """
-        return robot_from_topic("/".join(self._path(key)[:-2]))
+        *topic, _dds_type, _hash = self._path(key)
+        return robot_from_topic("/".join(topic))
 
     def writer_name(self, key: str) -> str | None:
         """The name of the sensor or map of ``key``; None for other topics. Raises InvalidInput as above."""
-        *_, name, dds_type, _hash = self._path(key)
-        named = (one for one in ros_streams().values() if one.is_named)
-        return name if any(dds_type == one.type.dds for one in named) else None
+        *topic, dds_type, _hash = self._path(key)
+        stream = topic_stream("/".join(topic), dds_type)
+        return name_from_topic("/".join(topic)) if stream is not None and has_named_topics(stream) else None
 
     @staticmethod
     def _path(key: str) -> list[str]:
@@ -99,7 +109,8 @@ class RmwKeys:
     def _topic(self, namespace: str, stream: StreamName, last_name: str) -> str:
         ros_type(stream)
         is_global = stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
-        return f"/{namespace}/{last_name}" if namespace and not is_global else f"/{last_name}"
+        path = f"/{last_name}{topic_suffix(stream)}"
+        return f"/{namespace}{path}" if namespace and not is_global else path
 
 
 class DdsKeys(RmwKeys):
@@ -107,31 +118,38 @@ class DdsKeys(RmwKeys):
 
     A bridge puts its namespace before every topic, before /tf and /clock too. Its keys have no
     domain, no type and no type hash, so of the topics that writers name only those with the names of the
-    streams can be read as such: ``scan``, ``imu``, ``map`` and so on.
+    streams can be read as such: ``scan``, ``imu``, ``map`` and so on; and those of cameras.
     """
 
     def key(self, robot: str, stream: StreamName, name: str = "") -> str:
         return self.topic(robot, stream, name)[1:]
 
-    def expression(self, robot: str, stream: StreamName) -> str:
-        return self._topic_pattern(robot, stream, stream)[1:]
+    def expression(self, robot: str, stream: StreamName, name: str = ANY) -> str:
+        last_name = name if topic_suffix(stream) else stream
+        return self._topic_pattern(robot, stream, last_name)[1:]
 
     def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
     def writer_name(self, key: str) -> str | None:
-        name = key.rpartition("/")[2]
-        return name if has_named_topics(name) else None
+        name = name_from_topic(key)
+        return name if has_named_topics(name) or without_suffix(key) != key else None
 
     def _topic(self, namespace: str, stream: StreamName, last_name: str) -> str:
         ros_type(stream)
-        return f"/{namespace}/{last_name}" if namespace else f"/{last_name}"
+        path = f"/{last_name}{topic_suffix(stream)}"
+        return f"/{namespace}{path}" if namespace else path
 
 
 def robot_from_topic(topic: str) -> str:
     """The robot of ``topic``: the last token of its namespace, SHARED in the root."""
-    tokens = topic.strip("/").split("/")
+    tokens = without_suffix(topic).strip("/").split("/")
     return tokens[-2] if len(tokens) > 1 else SHARED
+
+
+def name_from_topic(topic: str) -> str:
+    """The name of the stream or of the sensor of ``topic``."""
+    return without_suffix(topic).rpartition("/")[2]
 
 
 class FrameNames:

@@ -66,6 +66,37 @@ _FIELDS: dict[str, Fields] = {
         ("uint8[]", "data"),
         ("bool", "is_dense"),
     ),
+    "sensor_msgs/CompressedImage": (
+        ("std_msgs/Header", "header"),
+        ("string", "format"),
+        ("uint8[]", "data"),
+    ),
+    "sensor_msgs/Image": (
+        ("std_msgs/Header", "header"),
+        ("uint32", "height"),
+        ("uint32", "width"),
+        ("string", "encoding"),
+        ("uint8", "is_bigendian"),
+        ("uint32", "step"),
+        ("uint8[]", "data"),
+    ),
+    "sensor_msgs/RegionOfInterest": (
+        *(("uint32", name) for name in ("x_offset", "y_offset", "height", "width")),
+        ("bool", "do_rectify"),
+    ),
+    "sensor_msgs/CameraInfo": (
+        ("std_msgs/Header", "header"),
+        ("uint32", "height"),
+        ("uint32", "width"),
+        ("string", "distortion_model"),
+        ("float64[]", "d"),
+        ("float64[9]", "k"),
+        ("float64[9]", "r"),
+        ("float64[12]", "p"),
+        ("uint32", "binning_x"),
+        ("uint32", "binning_y"),
+        ("sensor_msgs/RegionOfInterest", "roi"),
+    ),
     "nav_msgs/MapMetaData": (
         ("builtin_interfaces/Time", "map_load_time"),
         ("float32", "resolution"),
@@ -215,6 +246,9 @@ TF_MESSAGE = RosType.from_fields("tf2_msgs/TFMessage")
 STRING = RosType.from_fields("std_msgs/String")
 LASER_SCAN = RosType.from_fields("sensor_msgs/LaserScan")
 POINT_CLOUD2 = RosType.from_fields("sensor_msgs/PointCloud2")
+COMPRESSED_IMAGE = RosType.from_fields("sensor_msgs/CompressedImage")
+IMAGE = RosType.from_fields("sensor_msgs/Image")
+CAMERA_INFO = RosType.from_fields("sensor_msgs/CameraInfo")
 OCCUPANCY_GRID = RosType.from_fields("nav_msgs/OccupancyGrid")
 CLOCK = RosType.from_fields("rosgraph_msgs/Clock")
 FLOAT64_MULTI_ARRAY = RosType.from_fields("std_msgs/Float64MultiArray")

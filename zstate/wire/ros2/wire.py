@@ -37,6 +37,7 @@ from zstate.wire.ros2.topics import (
     DdsKeys,
     FrameNames,
     RmwKeys,
+    name_from_topic,
     robot_from_topic,
 )
 
@@ -101,8 +102,8 @@ class Ros2Wire:
         qos = ros_stream(stream).qos
         return EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, qos).key
 
-    def expression(self, robot: str, stream: StreamName) -> str:
-        return self._keys.expression(robot, stream)
+    def expression(self, robot: str, stream: StreamName, name: str = ANY) -> str:
+        return self._keys.expression(robot, stream, name)
 
     def robot_from_key(self, key: str) -> str:
         return self._keys.robot_from_key(key)
@@ -155,7 +156,7 @@ class Ros2Wire:
         if stream is None or stream == "clock":
             return ()
         named = robot_from_topic(topic) if robot == ANY else robot
-        name = topic.rpartition("/")[2] if has_named_topics(stream) else ""
+        name = name_from_topic(topic) if has_named_topics(stream) else ""
         # a namespace or a name that ROS does not allow matches no topic
         with suppress(InvalidInput):
             if topic == self._keys.topic(named, stream, name):
