@@ -11,6 +11,7 @@ IMAGE = Stream(
     summary="pictures of a camera, compressed",
     named=True,
     bulk=True,
+    private=True,
     max_bytes=16 * MEGABYTE,
     start="start one: `zstate camera {robot} --device /dev/video0`",
     ros="zstate.cameras.ros2:IMAGE_STREAM",
