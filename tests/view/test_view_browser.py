@@ -108,7 +108,7 @@ def pixels_of(points: NDArray[np.float64], framing: CameraPose, size: tuple[int,
 
 
 @pytest.mark.robots
-@pytest.mark.parametrize("robot", ["panda", "talos"])
+@pytest.mark.parametrize("robot", ["panda", pytest.param("talos", marks=pytest.mark.soak)])
 def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab, show_view, sessions):
     with standing(sessions[0], robot):
         shown = show_view(sessions[1])
