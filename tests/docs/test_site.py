@@ -57,7 +57,9 @@ class LoadedAddresses(HTMLParser):
 
 def build(site: Path) -> None:
     """``-n`` and ``-W``: a reference without a target is an error, as is every warning."""
-    command = [sys.executable, "-m", "sphinx", "-nWq", "--keep-going", ROOT / "docs", site]
+    # No search for garbage, which takes a seventh of the time.
+    program = "import gc, sys; from sphinx.cmd.build import main; gc.disable(); sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "-nWq", "--keep-going", ROOT / "docs", site]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

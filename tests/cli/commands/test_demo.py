@@ -145,19 +145,6 @@ def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: in
 
 
 @pytest.mark.processes
-def test_other_commands_see_the_rover_and_its_room_without_an_option(spawn: Spawn):
-    demo = started(spawn, "demo", "rover")
-    until(lambda: "receiving 'rover'" in demo.stderr)
-    robots = json.loads(run_cli("ls", "--json").stdout)
-    room, rover = robots
-    writers = {(one["stream"], one["program"]) for one in rover["writers"]}
-    assert (room["robot"], rover["robot"]) == ("room", "rover")
-    assert {("joint_states", "rover-wheels"), ("imu", "rover-imu"), ("scan", "rover-laser")} <= writers
-    assert "odometry" in {stream for stream, _ in writers}
-    interrupted(demo)
-
-
-@pytest.mark.processes
 @pytest.mark.long
 def test_rover_without_the_libraries_of_maps_has_no_room():
     with missing_library("PIL"):
@@ -252,12 +239,16 @@ def test_demos_that_start_at_once_take_names_of_their_own(spawn: Spawn):
 
 
 @pytest.mark.processes
-def test_second_rover_and_its_room_have_names_of_their_own(spawn: Spawn):
+def test_other_commands_see_two_rovers_and_their_rooms_by_names_of_their_own(spawn: Spawn):
     demos = [started(spawn, "demo", "rover") for _ in range(2)]
     for demo in demos:
         until(lambda demo=demo: "it drives a square" in demo.stderr)
-    names = {robot["robot"] for robot in json.loads(run_cli("ls", "--json").stdout)}
-    assert names == {"rover", "rover-2", "room", "room-2"}
+    robots = {robot["robot"]: robot for robot in json.loads(run_cli("ls", "--json").stdout)}
+    assert robots.keys() == {"rover", "rover-2", "room", "room-2"}
+    for rover in ("rover", "rover-2"):
+        writers = {(one["stream"], one["program"]) for one in robots[rover]["writers"]}
+        assert {("joint_states", "rover-wheels"), ("imu", "rover-imu"), ("scan", "rover-laser")} <= writers
+        assert "odometry" in {stream for stream, _ in writers}
     for demo in demos:
         interrupted(demo)
 
