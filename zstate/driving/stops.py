@@ -79,10 +79,11 @@ def stop(
 ) -> DriverState:
     """Stop the driver of ``robot``, and return its state once it has stopped.
 
-    The driver stays stopped, also if it or this program restarts, until ``Commander.release``. "hold" leaves
-    the joints where they are, "relax" without torque: behind a router with access control only commanders and
-    operators switch it off, and the joints hold for others. ``reason`` is shown to users; it is cut after
-    1000 characters, and no text makes a stop fail. No claim is needed. Not a safety-rated channel.
+    The driver stays stopped, also if it or this program restarts, until ``Commander.release``. ``how`` "hold"
+    (the default) leaves the joints where they are, "relax" without torque: behind a router with access
+    control only commanders and operators switch it off, and the joints hold for others. ``reason`` is shown
+    to users; it is cut after 1000 characters, and no text makes a stop fail. No claim is needed. Not a
+    safety-rated channel.
 
     It is repeated until a driver has confirmed it. Raises Unreachable if none has within ``timeout_s`` [s].
     The stop stays latched in ``session`` then: a driver that can be reached later obeys it.

@@ -53,7 +53,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SourceHealth:
-    """The state of one source.
+    """The state of one source, by its ``name``.
 
     ``rate_hz`` is that of the newest readings, ``age_s`` how much older than the newest data of all sources
     its newest one is. ``nis_mean`` is the mean NIS of the last readings of ``dimension`` numbers, NaN without

@@ -185,6 +185,8 @@ def _check_sensors(sensors: Sequence[Sensor], wire: str, writer: str, *, has_map
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
 
+    ``program`` is the writer's name for others, by default the script's name.
+
     ``base`` gets the readings of the IMU ``imu`` and of the further ``sensors``, each by its name and with
     what is stated of its noise, whose class tells the kind: ``[("wheels", VelocityNoise(sigma=0.05))]``; and
     with ``has_joints`` the joint states, from the threads of their subscriptions.

@@ -22,11 +22,11 @@ _LIMITS = ByteLimits(unread=64 * 2**20, waiting=16 * 2**20)
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """A scan whose rays stand in ``target``: ``points`` (N, 3) [m], NaN where ``valid`` (N,) is False.
+    """A ``scan`` whose rays stand in ``target``: ``points`` (N, 3) [m], NaN where ``valid`` (N,) is False.
 
-    Each ray is placed by the pose at its own stamp. It is not valid if its range is no measurement, or if the
-    history of the buffer begins after it. ``is_rigid`` means that the times of the rays are not known, and
-    all are placed by the pose at the stamp of the scan.
+    ``sensor`` is the name of the scanner. Each ray is placed by the pose at its own stamp. It is not valid if
+    its range is no measurement, or if the history of the buffer begins after it. ``is_rigid`` means that the
+    times of the rays are not known, and all are placed by the pose at the stamp of the scan.
     """
 
     scan: Scan
@@ -66,7 +66,8 @@ class ScanListener(PlacingListener[Scan, PlacedScan]):
 
     ``sensor`` selects one scanner of the robot, on the native wire; "*": all of them. Frames come from
     ``buffer``; without one, the listener fills a buffer of its own with the transforms of the robot. Bare
-    frame names are the robot's own. A context manager.
+    frame names are the robot's own. ``clock`` is that of the buffer of its own; default: the system's. A
+    context manager.
     """
 
     def __init__(
