@@ -125,9 +125,7 @@ def test_clouds_of_other_fields_do_not_fit_into_one_table(tmp_path: Path):
             message = cloud_to_message(Cloud(START, "lidar", np.zeros(2, kind)), True)
             builder.encoder.write_message("r1", message, START, sensor)
     with Recording(path) as recording:
-        with pytest.raises(
-            InvalidInput, match="and later stamp, robot, writer, cloud, x, y, z, and"
-        ):
+        with pytest.raises(InvalidInput, match="and later stamp, robot, writer, cloud, x, y, z, and"):
             export_stream(recording, "cloud", tmp_path / "run.csv", "csv")
         assert export_points(recording, "cloud", tmp_path / "points") == (2, {})
 
