@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from zstate.cameras.camera import Camera
     from zstate.cameras.listener import CameraListener, Picture
     from zstate.cameras.publishers import CameraInfoPublisher, CameraPublisher
+    from zstate.cameras.ros_images import RosImage, RosImageListener
 
 __all__ = [
     "Camera",
@@ -16,6 +17,8 @@ __all__ = [
     "CameraListener",
     "CameraPublisher",
     "Picture",
+    "RosImage",
+    "RosImageListener",
     "load_camera",
 ]
 
@@ -25,6 +28,8 @@ _HOMES = {
     "CameraListener": "listener",
     "CameraPublisher": "publishers",
     "Picture": "listener",
+    "RosImage": "ros_images",
+    "RosImageListener": "ros_images",
     "load_camera": "calibration_file",
 }
 

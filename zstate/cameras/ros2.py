@@ -137,10 +137,12 @@ def decode_raw_image(payload: bytes, names: FrameNames) -> tuple[int, str, NDArr
     """The stamp [ns], the frame and the pixels of a sensor_msgs/Image, which the payload holds.
 
     The pixels are RGB (H, W, 3), or gray (H, W). Raises MessageError with the reason "truncated",
-    "malformed", "too large", or "foreign" for an encoding without 8 bits a channel.
+    "malformed", "too large", "no stamp", or "foreign" for an encoding without 8 bits a channel.
     """
     reader = CdrReader(payload, IMAGE.name)
     stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    if not stamp:
+        raise MessageError(f"the stamp of a {IMAGE.name} is zero, which means none in ROS", reason="no stamp")
     height, width, encoding = reader.count(), reader.count(), reader.text()
     reader.numbers(1, 1)  # the order of bytes, of which each channel has one
     step = reader.count()
