@@ -105,7 +105,8 @@ def decode_camera_info(payload: bytes, session: int, seq: int, names: FrameNames
     left, top, rows, columns = _REGION.unpack(reader.numbers(_REGION_NUMBERS, 4))
     reader.numbers(1, 1)
     sent_from_sensor = np.array([[1.0 / x, 0.0, -left / x], [0.0, 1.0 / y, -top / y], [0.0, 0.0, 1.0]])
-    k, p = sent_from_sensor @ k, sent_from_sensor @ p
+    with np.errstate(all="ignore"):  # what is not finite is malformed below
+        k, p = sent_from_sensor @ k, sent_from_sensor @ p
     if not k.any():  # not calibrated: drivers put any model and numbers beside that
         model, d = "plumb_bob", b""
     elif k[0, 1] or k[1, 0] or k[2].tolist() != [0.0, 0.0, 1.0]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.inbox import Inbox
 from zstate._util.refusals import Refusals
-from zstate.cameras.codecs import Pixels
 from zstate.cameras.ros2 import decode_raw_image
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.session import Session
@@ -21,12 +23,13 @@ from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import IMAGE
 
 
-class RosImage(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class RosImage:
     """A raw picture: stamp [ns], frame as the robot calls it, and uint8 RGB (H, W, 3) or gray (H, W)."""
 
     stamp: int
     frame: str
-    pixels: Pixels
+    pixels: NDArray[np.uint8]
 
 
 class RosImageListener(Closeable):
