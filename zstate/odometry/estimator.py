@@ -169,7 +169,7 @@ class BaseEstimator:
 
     Events may arrive in any order; an event that comes twice counts once. A reading more than ``history_s``,
     and more than a second, after the newest one is used once a second one confirms it. If time goes back by
-    as much for half a second of readings, as in a recording in a loop, it starts anew, and ``epoch``, the
+    as much for half a second of readings, as in a recording in a loop, it restarts, and ``epoch``, the
     number of such starts and of calls of ``reset``, grows (``zstate.odometry.stamp_order``).
 
     Not safe for several threads at once. Raises InvalidInput for a sensor that moves on the base,
@@ -209,7 +209,7 @@ class BaseEstimator:
             self._mount(wheels.frame)
         self._initial_pose = initial_pose
         self.epoch = 0
-        """How often it has started anew: by ``reset``, or because time went back."""
+        """How often it has restarted: by ``reset``, or because time went back."""
         self.placements = 0
         """How often it was placed by ``set_pose``."""
         self._begin()
@@ -231,10 +231,10 @@ class BaseEstimator:
         self._sources: dict[str, SourceRecord] = {}
         self._follower = None
         self._restarts: dict[str, tuple[int, str]] = {}
-        """By source, when and why it made the estimate start anew."""
+        """By source, when and why it restarted the estimate."""
 
     def reset(self, odom_from_base: Transform | None = None) -> None:
-        """Start anew: forget all events, biases and the pose, and align again, at rest.
+        """Restart: forget all events, biases and the pose, and align again, at rest.
 
         The base is then at the origin of ``odom``, or at ``odom_from_base`` from the next event on, as with
         ``initial_pose``, whose place it takes. It is no correction: in the terms of REP 105 the pose in
@@ -749,7 +749,7 @@ class BaseEstimator:
         self._begin()
         self._order = order
         self.epoch += 1
-        text = f"time went back by {format_duration(size_ns)}; the odometry started anew"
+        text = f"time went back by {format_duration(size_ns)}; the odometry restarted"
         self._record(source)
         self._restarts = {source: (order.newest or 0, text)}
 

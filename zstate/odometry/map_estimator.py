@@ -219,7 +219,7 @@ class MapEstimator:
         return found
 
     def _variances(self, source: str, covariance: ArrayLike | None, noise: FixNoise) -> Floats:
-        """Of x, y and z [m^2], (3,)."""
+        """The variances of x, y and z [m^2], (3,)."""
         if noise.sigmas is not None:
             across, up = noise.sigmas
         else:

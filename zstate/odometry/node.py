@@ -151,7 +151,7 @@ def _failure(error: Exception, place: str) -> tuple[str, str]:
 
 
 class _MapPublishers(NamedTuple):
-    """Of map -> odom, of the pose of the base in the map, and of its datum."""
+    """Publishers of map -> odom, of the pose of the base in the map, and of its datum."""
 
     edge: TransformPublisher
     pose: PosePublisher
@@ -280,7 +280,7 @@ class OdometryNode(Closeable):
             self._opened = opening.pop_all()
 
     def _restart(self) -> None:
-        """Publish from the next stamp on, whatever it is; the estimator has started anew."""
+        """Publish from the next stamp on, whatever it is; the estimator has restarted."""
         self._imu_stamp = self._due = self._newest = self._assessed = _LONG_AGO
         self._epoch = self.base.epoch
         self._logged: dict[str, int] = {}
@@ -317,7 +317,7 @@ class OdometryNode(Closeable):
         return in_plane(state) if self._is_planar else state
 
     def reset(self, odom_from_base: Transform | None = None) -> None:
-        """Start anew, as ``BaseEstimator.reset``."""
+        """Restart, as ``BaseEstimator.reset``."""
         with self._lock:
             self.base.reset(odom_from_base)
 

@@ -1,4 +1,4 @@
-"""Requests to a running odometry node: to start anew, or to place the base.
+"""Requests to a running odometry node: to restart, or to place the base.
 
 A request is a query of ``zstate/<robot>/@odometry/<writer>`` with the parameter ``do``: ``reset`` or
 ``set_pose``. ``pose``, which ``set_pose`` needs, is odom_from_base: x y z [m] and qx qy qz qw, separated by

@@ -28,7 +28,7 @@ from zstate.sources.square_drive import SquareDriveState, WheelPair
 from zstate.transform import Transform
 
 WheelRates: TypeAlias = tuple[float, float]
-"""Of the left and the right wheel [rad/s]."""
+"""The rates of the left and the right wheel [rad/s]."""
 
 _STEP_NS = 1_000_000
 _STEP_S = 1e-9 * _STEP_NS

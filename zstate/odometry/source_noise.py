@@ -28,7 +28,7 @@ CovarianceKind: TypeAlias = Literal["stated", "dependent", "independent"]
 """What covariances of poses of another odometry are: of no use, of dead reckoning, or of each pose alone."""
 
 HEIGHT_FACTOR = 10.0
-"""Of a height by satellites, all of which are above: it is less sure than the position."""
+"""How much less sure a height by satellites is than the position: all of them are above."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -452,8 +452,8 @@ def recorded_model(
     """The model of a described robot, or None if its joint states cannot be used with it.
 
     That is the case without joint states, with a URDF that cannot be parsed, and if the first joint states
-    together lack a joint: in a bag of ROS the rest may be on another topic, or in tf alone. Of a robot with
-    ``partial_joint_states`` drivers may be missing, as they may be live.
+    together lack a joint: in a bag of ROS the rest may be on another topic, or in tf alone. A robot with
+    ``partial_joint_states`` may lack drivers, as it may live.
     """
     robot, message = description.writer.robot, description.message
     assert isinstance(message, RobotDescription)

@@ -161,7 +161,7 @@ class RecordingEncoder:
         self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
         self._latched: dict[str, dict[str, ChannelEncoder]] = {}
         self._map_bytes: dict[str, int] = {}
-        """Of the maps that are repeated, by the keys of ``_latched_key``."""
+        """Sizes of the maps that are repeated, by the keys of ``_latched_key``."""
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
         self._orders: dict[str, OrderRegistry] = {}
         self._pending = PendingSamples()

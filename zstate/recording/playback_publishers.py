@@ -89,7 +89,7 @@ class PlaybackPublishers(Closeable):
         self._others: dict[str, PassthroughPublisher] = {}
         self._parts: dict[str, JointPartPlayback] = {}
         self._named: dict[_Named, PassthroughPublisher] = {}
-        """Of sensors and of odometry."""
+        """Publishers of sensors and of odometry."""
         self._copied = {_edge_of_odometry(one) for one in writers} & set(writers)
         """The writers of edges that odometry has as well."""
         self._open_passthrough = partial(
@@ -332,7 +332,7 @@ class JointPartPlayback(Closeable):
     """Publishes the recorded joint states of drivers of ``robot``, each set of joints by a writer of its own.
 
     A driver that was restarted under another name, as by default, continues as the writer of its
-    predecessor. Of two sets with joints in common the one that counts is as in ``RecordedJoints``: the writer
+    predecessor. If two sets have joints in common, one counts, as in ``RecordedJoints``: the writer
     of the other set is closed. Nodes of ROS, whose joint states have no names, are named "recorded-1" and so
     on. ``open_publisher(robot, streams, name)`` opens a writer; it may raise SecondWriter. Without a
     ``model`` the joints are not owned.

@@ -60,8 +60,8 @@ class ScanListener(PlacingListener[Scan, PlacedScan]):
     ``for placed in scans`` and ``async for placed in scans`` return a PlacedScan for each scan, in the order
     in which they became placeable, and end with ``close()``. A scan waits for the pose of its *last* ray, at
     most ``timeout_s`` from its arrival: then it is counted in ``dropped`` by the name of the error, and
-    ``last_reason`` names the edge that was too late. Of more than 256 scans or 64 MiB that are unread, or
-    256 scans or 16 MiB of one sensor that wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
+    ``last_reason`` names the edge that was too late. If more than 256 scans or 64 MiB are unread, or
+    256 scans or 16 MiB of one sensor wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
     ``refused`` counts messages that are no scan, by reason; the first of each reason is also logged.
 
     ``sensor`` selects one scanner of the robot, on the native wire; "*": all of them. Frames come from

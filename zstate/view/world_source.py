@@ -32,7 +32,7 @@ _TIMEOUT_S = 1.0
 _MAX_WAITING = 256
 _MAX_SCANS = 1000
 _MAX_BYTES = 4_000_000
-"""Of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
+"""Limits of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
 _MAX_WRITERS = 64
 _UNKNOWN_S = 10.0
 """How long a sensor may be silent after its first scan."""

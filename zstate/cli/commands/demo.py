@@ -87,7 +87,7 @@ class Demo(NamedTuple):
 @click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
 @options.rate_option
 @options.seconds_option
-# Of the process with the hardware that `zstate demo rover` starts; its ROBOT is the name of the rover.
+# For the process with the hardware that `zstate demo rover` starts; its ROBOT is the name of the rover.
 @click.option("--program", type=click.Choice(("wheels",)), hidden=True, allow_from_autoenv=False)
 @options.plain_session_options
 def demo_command(

@@ -73,8 +73,8 @@ def echo_command(
 
     ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
     all their writers; on a ROS wire these are all messages of /tf, or /joint_states. Joint setpoints are what
-    the program that owns the robot's hardware writes to it, while it moves or holds the joints. Of known
-    covariances of odometry and measurements the standard deviations are printed, in the same units. A
+    the program that owns the robot's hardware writes to it, while it moves or holds the joints. Known
+    covariances of odometry and measurements are printed as standard deviations, in the same units. A
     scan or a map is a summary: geometry and counts; --json, --csv and --field also have the ranges of a scan
     [m], null where nothing was measured.
 

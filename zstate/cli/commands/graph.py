@@ -33,8 +33,8 @@ _PROGRAM_FILL = "#eef2ff"
 def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the writers and readers of the streams of ROBOT, or of all robots.
 
-    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear. Of a
-    robot with a driver, joint_commands go from its commander to the driver.
+    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear. If
+    a robot has a driver, joint_commands go from its commander to the driver.
     Streams that are read but have no writer stand out. On a ROS wire: the nodes and the topics of robot
     states, in all namespaces.
 

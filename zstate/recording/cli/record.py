@@ -104,9 +104,9 @@ def record_command(
     a map at its start and when it changes. After a crash all but the last 0.5 s is in the file; `zstate
     recover` makes a complete file of it.
 
-    Of drivers it keeps the commands, as joint states on /joint_commands; the states with motions and their
-    outcomes on /diagnostics, which Foxglove and rqt show; and the stops on /stops. A replay never publishes
-    these.
+    It keeps the commands to drivers, as joint states on /joint_commands; the states of drivers, with motions
+    and their outcomes, on /diagnostics, which Foxglove and rqt show; and the stops on /stops. A replay never
+    publishes these.
 
     FILE may have the start time in its name: %Y %m %d %H %M %S are replaced by the local time (also %y and
     %j; %% is a percent sign). The default, rec-%Y%m%d-%H%M%S.mcap in the working directory, gives each start

@@ -1,6 +1,6 @@
 """How ROS 2 carries the streams: the type and the QoS of their topics, as ``Stream.ros`` names them.
 
-Those of plugins are in their folders, beside the functions that encode and decode their messages.
+Those of plugins are in their folders, next to the functions that encode and decode their messages.
 """
 
 from __future__ import annotations
