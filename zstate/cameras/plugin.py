@@ -35,7 +35,7 @@ PLUGIN = Plugin(
         "camera": Command(
             "zstate.cameras.cli.camera:camera_command",
             "Write",
-            "Publish the pictures of a camera or of a video file.",
+            "Publish the pictures of a camera, a video file or a simulated camera.",
         ),
     },
     synonyms={

@@ -4,13 +4,24 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, missing_library, run_cli, started
+from helpers.cli_runner import (
+    Spawn,
+    failure,
+    interrupted,
+    missing_library,
+    published_robot,
+    run_cli,
+    started,
+)
 from helpers.pictures import video_file
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 
-from zstate import connect
+from zstate import TransformListener, connect
 from zstate.cameras import CameraListener
+from zstate.cameras.cli.mesh_files import MeshFiles
+from zstate.model.geometry import MeshFile
 
 CALIBRATION = """\
 image_width: {width}
@@ -58,10 +69,72 @@ def test_seconds_end_a_loop(tmp_path: Path):
     assert re.search(r"\d pictures published", ended.stderr)
 
 
-def test_a_file_and_a_device_or_neither_are_wrong_usage(tmp_path: Path):
+def test_no_source_and_two_of_them_are_wrong_usage(tmp_path: Path):
     video = video_file(tmp_path / "walk.avi", count=1)
-    for arguments in ((), (video, "--device", "/dev/video0")):
-        assert "--device /dev/videoN or a video FILE" in failure("camera", "r1", *arguments, code=2)
+    for arguments in ((), (video, "--device", "/dev/video0"), (video, "--simulate")):
+        text = failure("camera", "r1", *arguments, code=2)
+        assert "give --device /dev/videoN, a video FILE or --simulate, one of them" in text
+    for option in (("--rate", "5"), ("--world-frame", "map")):
+        text = failure("camera", "r1", video, *option, code=2)
+        assert "--rate and --world-frame are for --simulate" in text
+
+
+@pytest.mark.processes
+def test_a_simulated_camera_sees_the_robot_at_its_instants(spawn: Spawn):
+    """The lens is in the tool, which looks along the arm; pictures have stamps of its joints."""
+    with published_robot("rrbot"):
+        child = started(spawn, "camera", "rrbot", "--simulate", "--frame", "tool", "--rate", "20")
+        line = "rrbot: 640 x 480, simulated, in tool, 20 Hz, on zstate/rrbot/image/camera"
+        assert child.line() == line
+        assert "simulating a camera in tool; the floor stands in rrbot/world" in child.stderr
+        with (
+            connect() as session,
+            TransformListener(session, "rrbot") as listener,
+            CameraListener(session, "rrbot") as pictures,
+        ):
+            picture = next(one for one in pictures if one.camera is not None)
+            listener.buffer.wait("rrbot/world", "rrbot/tool", picture.stamp, timeout_s=DEADLINE_S)
+            assert picture.frame == "rrbot/tool"
+            assert picture.size == (640, 480)
+            assert picture.camera.k.tolist() == [500.0, 500.0, 319.5, 239.5]
+            assert picture.decode().std() > 0.0
+        interrupted(child)
+
+
+@pytest.mark.processes
+def test_a_simulated_camera_has_the_calibration_of_a_file_and_waits_for_its_frame(tmp_path: Path):
+    options = ("--simulate", "--name", "wrist", "--info", calibration(tmp_path))
+    with published_robot("rrbot"):
+        shown = run_cli("camera", "rrbot", *options, "--frame", "tool", "--seconds", "0.5").stdout
+        assert "rrbot: 64 x 48, simulated, in tool, 10 Hz, on zstate/rrbot/image/wrist" in shown
+        text = failure("camera", "rrbot", *options, "--seconds", "0.5")
+        assert "no picture in 0.5 s" in text
+        assert "'rrbot/wrist'" in text
+
+
+def test_meshes_that_are_not_found_are_named_once(capsys: pytest.CaptureFixture[str]):
+    files = MeshFiles()
+    for _ in range(2):
+        assert files.read(MeshFile("package://nowhere/part.stl")) == ()
+    assert capsys.readouterr().err.count("not drawn: package://nowhere/part.stl: ") == 1
+    with missing_library("zstate.view.meshes"):
+        assert MeshFiles().read(MeshFile("package://nowhere/part.stl")) == ()
+    assert "pip install 'zstate[view]'" in capsys.readouterr().err
+
+
+def test_a_mirrored_mesh_keeps_its_faces_outwards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    package = tmp_path / "part"
+    package.mkdir()
+    (package / "package.xml").write_text("<package><name>part</name></package>")
+    (package / "box.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
+    for scale in ((1.0, 1.0, 1.0), (2.0, -1.0, 1.0)):
+        (part,) = MeshFiles().read(MeshFile("package://part/box.obj", scale))
+        a, b, c = np.moveaxis(np.asarray(part.points)[np.asarray(part.triangles)], 1, 0)
+        volume = (np.cross(b, c) * a).sum() / 6.0
+        assert volume == pytest.approx(abs(np.prod(scale)) / 6.0)
 
 
 def test_a_wrong_device_and_a_wrong_file_are_named(tmp_path: Path):
