@@ -92,8 +92,7 @@ def _discover_measured_graph(session: Session) -> Graph:
             *measured_streams(),
             "joint_commands",
         )
-        for stream in always:
-            statistics.subscribe(stream)
+        statistics.watch(always)
         robots = discover(session)
         check_found(robots)
         readers = discover_readers(session, _READERS_WITHIN_S)
@@ -113,8 +112,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         statistics.wait(expected, _MEASURED_WITHIN_S)
 
         def rate_hz(robot: str, stream: StreamName, writer: WriterId) -> float | None:
-            source = statistics.get(WriterKey(robot, stream, writer.session))
-            return None if source is None else source.published_hz()
+            return statistics.published_hz(WriterKey(robot, stream, writer.session))
 
         return build_graph(robots, readers, rate_hz)
 

@@ -32,7 +32,7 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import printable
-from zstate.plugins import edge_streams, is_own, measured_streams
+from zstate.plugins import edge_streams, is_bulk, is_own, measured_streams
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import ANY, check_robot
 
@@ -339,8 +339,9 @@ class RobotMonitor(Closeable):
         self._counted = self._opened.enter_context(counted)
         # The streams with a rate apart from that of the joint states; on a ROS wire edges are on /tf, which
         # the listener counts.
-        self._rated = (*edge_streams(), *measured_streams())
-        carried = filter(get_wire(wire).carries, measured_streams()) if is_ros(wire) else self._rated
+        measured = [stream for stream in measured_streams() if not is_bulk(stream)]
+        self._rated = (*edge_streams(), *measured)
+        carried = filter(get_wire(wire).carries, measured) if is_ros(wire) else self._rated
         for stream in carried:
             counted.subscribe(stream, robot)
 
