@@ -75,6 +75,9 @@ class Stream:
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
       echo` prints it; by default of all fields, a ``frame`` with its full name.
     - ``full_document``: the same for its options --json, --csv and --field, if that has more.
+    - ``columns``: ``"module:function"`` that makes columns of numbers of a message and the name of its robot,
+      by name and of one length, the first of them ``stamp`` [ns]: `zstate export` writes several rows for
+      each message, as a cloud has several points. By default a message is one row, with its fields.
     - ``recorded``: ``"module:name"`` of how recordings have it where ROS 2 does not carry it
       (zstate.wire.ros2.streams.RecordedForm).
     - ``ros``: ``"module:name"`` of how ROS 2 carries it (zstate.wire.ros2.streams.RosStream); empty if it
@@ -96,6 +99,7 @@ class Stream:
     start: str = ""
     document: str = ""
     full_document: str = ""
+    columns: str = ""
     recorded: str = ""
     ros: str = ""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -64,10 +64,11 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
 @click.option(
     "--stream",
     metavar="NAME",
-    help="Instead: the messages of a stream of measurements of another package, one row each.",
+    help="Instead: the messages of a stream of measurements, one row each; of clouds a row for each point.",
 )
 @click.option("--csv", "kind", flag_value="csv", help="Write comma-separated values.")
 @click.option("--parquet", "kind", flag_value="parquet", help="Write Parquet.")
+@click.option("--ply", "kind", flag_value="ply", help="Write each cloud of --stream as PLY, into a folder.")
 @click.option(
     "--output",
     metavar="FILE",
@@ -82,7 +83,7 @@ def export_command(
     rate: float | None,
     stamps: NDArray[np.int64] | None,
     stream: str | None,
-    kind: TableFormat | None,
+    kind: TableFormat | Literal["ply"] | None,
     output: str | None,
     overwrite: bool,
 ) -> None:
@@ -105,6 +106,8 @@ def export_command(
     zstate export run.mcap panda --csv --rate 50 --pose panda_link0 panda_hand
     zstate export run.mcap --parquet --stamps images.txt --output images.parquet
     zstate export run.mcap --stream battery                  # run.battery.csv
+    zstate export run.mcap --stream cloud --parquet          # run.cloud.parquet, a row for each point
+    zstate export run.mcap --stream cloud --ply              # run.cloud.ply/diffbot.lidar.STAMP.ply
     """
     if stream is not None:
         if poses or rate is not None or stamps is not None:
@@ -115,6 +118,8 @@ def export_command(
         return
     if kind is None:
         raise click.UsageError("Missing option '--csv' or '--parquet'.")
+    if kind == "ply":
+        raise click.UsageError("--ply writes points: name their stream, such as --stream cloud")
     if rate is not None and stamps is not None:
         raise click.UsageError("--rate and --stamps exclude each other: both choose the rows")
     from zstate.errors import RecordingError
@@ -135,23 +140,35 @@ def export_command(
 
 
 def _export_stream(
-    file: str, robot: str | None, stream: str, kind: TableFormat, output: str | None, *, overwrite: bool
+    file: str,
+    robot: str | None,
+    stream: str,
+    kind: TableFormat | Literal["ply"],
+    output: str | None,
+    *,
+    overwrite: bool,
 ) -> None:
     from zstate.errors import RecordingError
+    from zstate.plugins import stream_named
     from zstate.recording.recording import Recording
-    from zstate.recording.stream_export import export_stream
+    from zstate.recording.stream_export import export_points, export_stream
 
     path = Path(output) if output else Path(file).with_suffix(f".{stream}.{kind}")
     with Recording(file, robot) as recording:
         try:
-            rows, refused = export_stream(recording, stream, path, kind, overwrite=overwrite)
+            if kind == "ply":
+                count, refused = export_points(recording, stream, path, overwrite=overwrite)
+            else:
+                count, refused = export_stream(recording, stream, path, kind, overwrite=overwrite)
         except RecordingError as error:
             fail(str(error).replace("overwrite=True", "--overwrite"))
-    losses = ", ".join(f"{count_text(count, 'message')} left out ({why})" for why, count in refused.items())
-    where = f"{path} ({size_text(path.stat().st_size)})"
-    print_wrapped(
-        f"exported {count_text(rows, 'message')} of {stream} into {where}; {losses or 'nothing missing'}"
+    items = count_text(
+        count, "file" if kind == "ply" else "row" if stream_named(stream).columns else "message"
     )
+    files = [*path.iterdir()] if kind == "ply" else [path]
+    losses = ", ".join(f"{count_text(count, 'message')} left out ({why})" for why, count in refused.items())
+    where = f"{path} ({size_text(sum(one.stat().st_size for one in files))})"
+    print_wrapped(f"exported {items} of {stream} into {where}; {losses or 'nothing missing'}")
 
 
 class ExportProgress:
