@@ -110,6 +110,7 @@ GUESTS = {
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),
     ("scans/map_metadata.py", "yaml"),
+    ("cameras/calibration_file.py", "yaml"),
 }
 
 # Not in what the two nodes load when they are imported: a reader of "joint positions in, poses out" passes

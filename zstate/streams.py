@@ -70,6 +70,8 @@ class Stream:
       Without ``latched`` they are refused above 1 MB in any case, with ``bulk`` above 64 MB.
     - ``bulk``: its samples are large, as clouds and images are, and give way to those of all other streams:
       Zenoh sends them with a lower priority, and no more than 8 wait for a reader.
+    - ``private``: it shows people and places, as pictures do; access control has a role that does not read
+      it.
     - ``version``: of its messages, in their Zenoh encoding. Fields may be appended within a version.
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
@@ -94,6 +96,7 @@ class Stream:
     named: bool = False
     latched: bool = False
     bulk: bool = False
+    private: bool = False
     max_bytes: int = MEASUREMENT_BYTES
     version: int = 1
     start: str = ""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from zstate._util.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from zstate.cameras.calibration_file import load_camera
     from zstate.cameras.camera import Camera
     from zstate.cameras.listener import CameraListener, Picture
     from zstate.cameras.publishers import CameraInfoPublisher, CameraPublisher
@@ -15,6 +16,7 @@ __all__ = [
     "CameraListener",
     "CameraPublisher",
     "Picture",
+    "load_camera",
 ]
 
 _HOMES = {
@@ -23,6 +25,7 @@ _HOMES = {
     "CameraListener": "listener",
     "CameraPublisher": "publishers",
     "Picture": "listener",
+    "load_camera": "calibration_file",
 }
 
 if not TYPE_CHECKING:  # type checkers would take any name for one of the package
