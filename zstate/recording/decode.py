@@ -106,7 +106,8 @@ class RecordedWriter:
         elif child_frame(channel) is None:
             for stream, carried in ros_streams().items():
                 is_named = name == stream or carried.is_named
-                if is_named and channel.type_name == carried.type.name:
+                is_of_type = channel.type_name == carried.type.name
+                if is_named and (is_of_type or carried.recorded_form(channel.type_name) is not None):
                     break
             else:
                 found = None if foreign else _stream_of_form(name, channel.type_name)
@@ -270,6 +271,8 @@ class DecodedRecording:
                 messages = (form.decode(record.payload, writer.session, seq),)
             elif channel.json is not None:
                 messages = (channel.json.decode(record.payload),)
+            elif (decode := channel.decode_form) is not None:
+                messages = (decode(record.payload, writer.session, seq, channel.names),)
             else:
                 topic = channel.topic
                 messages = channel.ros.messages(topic, record.payload, writer.session, seq, channel.names)
@@ -320,10 +323,13 @@ class DecodedRecording:
                 json = None
                 if channel.encoding == JSON:
                     json = JsonDecoder(stream_named(writer.stream), channel.metadata.get(VERSION, "1"))
+                carried = ros_streams().get(writer.stream)
+                form = None if carried is None else carried.recorded_form(channel.type_name)
                 decoder = ChannelDecoder(
                     *(writer, topic, names, RosDecoder(), child_frame(channel) or ""),
                     posed and names.to_zstate(posed),
                     json,
+                    None if form is None else form.decode,
                 )
             self._known[channel] = decoder
         return self._known[channel]
@@ -333,7 +339,8 @@ class ChannelDecoder(NamedTuple):
     """The writer of a channel, the stream that its topic is named after, and the decoder of its messages.
 
     A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS; one of
-    poses, those of the frame ``posed``, empty for the base of the robot. ``json`` decodes a channel in JSON.
+    poses, those of the frame ``posed``, empty for the base of the robot. ``json`` decodes a channel in JSON,
+    ``decode_form`` one with messages in another form than ROS carries them.
     """
 
     writer: RecordedWriter
@@ -343,6 +350,7 @@ class ChannelDecoder(NamedTuple):
     covariances_of: str
     posed: str
     json: JsonDecoder | None
+    decode_form: Callable[..., Message] | None
 
     @property
     def uncarried(self) -> str:
