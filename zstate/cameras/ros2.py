@@ -97,7 +97,7 @@ def decode_video(payload: bytes, session: int, seq: int, names: FrameNames) -> C
         reader.sequence(1),
         reader.text(),
     )
-    form = next((form for form in _VIDEO if form == text), None)
+    form: PictureFormat | None = next((one for one in _VIDEO if one == text), None)
     if form is None:
         known = ", ".join(_VIDEO)
         raise MessageError(f"a {COMPRESSED_VIDEO.name} of {text!r}; known are {known}", reason="foreign")

@@ -60,8 +60,9 @@ class RosStream(NamedTuple):
     def recorded_form(self, type_name: str) -> DisplayedForm | None:
         """The form of recorded messages of the type ``type_name``; None for those of ``type``."""
         form = self.displayed
-        is_recorded = form is not None and form.decode is not None
-        return form if is_recorded and form.type.name == type_name else None
+        if form is None or form.decode is None or form.type.name != type_name:
+            return None
+        return form
 
 
 class RecordedForm(NamedTuple):
