@@ -1,4 +1,4 @@
-"""Pictures and videos in recordings: with the bytes that were published, read by rosbags and replayed."""
+"""Pictures and packets in recordings: with the bytes that were published, read by rosbags and replayed."""
 
 from __future__ import annotations
 
