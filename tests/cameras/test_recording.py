@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.manual_cdr import STORE
 from helpers.pictures import jpeg, png, video
 from helpers.processes import until
 from rosbags.highlevel import AnyReader
@@ -15,7 +14,7 @@ from zstate import Recorder, Recording
 from zstate.cameras import Camera, CameraPublisher
 from zstate.recording.decode import RecordedWriter
 from zstate.recording.storage import Channel
-from zstate.wire.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE
+from zstate.wire.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, COMPRESSED_VIDEO, RosType
 
 STAMP = 1_700_000_000_000_000_000
 K = (60.0, 61.0, 31.5, 23.5)
@@ -45,14 +44,15 @@ def recorded(request, sessions, tmp_path: Path) -> Path:
 
 
 def test_rosbags_reads_the_bytes_on_the_topics_of_image_transport(recorded: Path):
-    with AnyReader([recorded], default_typestore=STORE) as reader:
+    with AnyReader([recorded]) as reader:
         topics = {one.topic: one.msgtype for one in reader.connections}
         assert topics == {
             "/wrist/image_raw/compressed": COMPRESSED_IMAGE.name,
+            "/wrist/image_raw/foxglove": COMPRESSED_VIDEO.name,
             "/wrist/camera_info": CAMERA_INFO.name,
         }
         messages = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
-    pictures = [message for topic, message in messages if topic.endswith("compressed")][-3:]
+    pictures = [message for topic, message in messages if topic.startswith("/wrist/image_raw")][-3:]
     assert {one.format: one.data.tobytes() for one in pictures} == SENT
     (info, *_) = [message for topic, message in messages if topic.endswith("info")]
     assert (info.width, info.height, info.header.frame_id) == (64, 48, "lens")
@@ -70,16 +70,20 @@ def test_a_recording_has_the_messages_under_the_name_of_the_camera(recorded: Pat
 
 
 @pytest.mark.parametrize(
-    ("topic", "robot", "name"),
+    ("topic", "kind", "robot", "name"),
     [
-        ("/r1/wrist/image_raw/compressed", "r1", "wrist"),
-        ("/r1/camera/color/image_raw/compressed", "r1", "camera_color"),
-        ("/camera/image_raw/compressed", "ros", "camera"),
-        ("/r1/wrist/compressed", "r1", "wrist_compressed"),
+        ("/r1/wrist/image_raw/compressed", COMPRESSED_IMAGE, "r1", "wrist"),
+        ("/r1/camera/color/image_raw/compressed", COMPRESSED_IMAGE, "r1", "camera_color"),
+        ("/camera/image_raw/compressed", COMPRESSED_IMAGE, "ros", "camera"),
+        ("/r1/wrist/compressed", COMPRESSED_IMAGE, "r1", "wrist_compressed"),
+        ("/r1/wrist/image_raw/foxglove", COMPRESSED_VIDEO, "r1", "wrist"),
+        ("/r1/wrist/video", COMPRESSED_VIDEO, "r1", "wrist_video"),
     ],
 )
-def test_in_bags_of_ros_the_topic_without_its_last_names_gives_the_camera(topic: str, robot: str, name: str):
-    channel = Channel(topic, COMPRESSED_IMAGE.name, "cdr", {}, 1)
+def test_in_bags_of_ros_the_topic_without_its_last_names_gives_the_camera(
+    topic: str, kind: RosType, robot: str, name: str
+):
+    channel = Channel(topic, kind.name, "cdr", {}, 1)
     writer = RecordedWriter.from_channel(channel, ["r1"])
     assert writer is not None
     assert (writer.robot, writer.stream, writer.edge_writer) == (robot, "image", name)
