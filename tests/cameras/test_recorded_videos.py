@@ -43,11 +43,12 @@ TYPES = {
 }
 
 
-def write(path: Path, form: Any) -> list[CompressedImage]:
-    """The pictures of r1's camera "wrist", of a robot alone in the file."""
+def write(path: Path, form: Any, *, lost: int = -1) -> list[CompressedImage]:
+    """The pictures of r1's camera "wrist", of a robot alone in the file, without number ``lost``."""
     messages = [
         CompressedImage(START + number * PERIOD, number, 7, "lens", form, data)
         for number, data in enumerate(PICTURES[form])
+        if number != lost
     ]
     with RecordingBuilder(path, "r1") as builder:
         for message in messages:
@@ -97,6 +98,20 @@ def test_a_video_is_recorded_live_and_replayed_packet_for_packet(
     assert (report.refused, listener.refused) == ({}, {})
     wanted = pixels(brightness=20 * (len(packets) - 1)).astype(int)
     assert np.abs(received[0].decode() - wanted).mean() < 4.0
+
+
+def test_a_packet_that_the_recording_has_lost_is_missing_in_its_replay(
+    sessions: tuple[Session, Session], tmp_path: Path
+):
+    writer, reader = sessions
+    write(tmp_path / "run.mcap", "h264", lost=5)  # 6 and 7 need it, and 4 is a key frame
+    with CameraListener(reader, "r1") as listener, Player(writer, tmp_path / "run.mcap") as player:
+        wait_for_reader(writer, "zstate/r1/image/wrist")
+        player.run()
+        until(lambda: listener.refused.get("no key frame", 0) >= 2)
+    assert listener.refused == {"no key frame": 2}
+    assert listener.latest is not None
+    assert listener.latest.stamp == START + 4 * PERIOD
 
 
 @pytest.fixture(scope="module")
