@@ -15,8 +15,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zstate import Recording
-from zstate.cameras import CameraListener, CameraPublisher
-from zstate.cameras.messages import CompressedImage
+from zstate.cameras import Camera, CameraListener, CameraPublisher
+from zstate.cameras.camera import camera_to_message
+from zstate.cameras.messages import CameraInfo, CompressedImage
 from zstate.cameras.ros2 import decode_video, encode_video
 from zstate.errors import MessageError
 from zstate.net.session import Session
@@ -24,6 +25,7 @@ from zstate.recording.info import read_info, recorded_robots
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
+from zstate.wire.messages import with_field
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import COMPRESSED_VIDEO
@@ -31,6 +33,7 @@ from zstate.wire.ros2.types import COMPRESSED_VIDEO
 NAMES = FrameNames(Ros2Options(), "r1")
 START = 1_700_000_000_000_000_000
 PERIOD = 33_333_333
+FISHEYE = (0.01, -0.002, 0.0003, -0.00004)
 PICTURES: dict[Any, list[bytes]] = {
     "jpeg": [jpeg(brightness=20 * number) for number in range(5)],
     "png": [png()],
@@ -112,6 +115,22 @@ def test_a_packet_that_the_recording_has_lost_is_missing_in_its_replay(
     assert listener.refused == {"no key frame": 2}
     assert listener.latest is not None
     assert listener.latest.stamp == START + 4 * PERIOD
+
+
+def test_a_calibration_keeps_the_time_of_a_line_which_ros_does_not_carry(tmp_path: Path):
+    def info(line_time_ns: int) -> CameraInfo:
+        camera = Camera(64, 48, (60.0, 61.0, 31.5, 23.5), FISHEYE, "equidistant", "lens", line_time_ns)
+        return with_field(camera_to_message(camera, START), "session", 7)
+
+    messages = [info(20_000), info(0), info(30_000)]
+    with RecordingBuilder(tmp_path / "run.mcap", "r1") as builder:
+        for number, message in enumerate(messages):
+            builder.encoder.write_message("r1", message, START + number, "wrist")
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert [one.message for one in recording.measurements("camera_info")] == messages
+    with AnyReader([tmp_path / "run.mcap"]) as reader:
+        read = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
+    assert [(one.distortion_model, tuple(one.d)) for one in read] == [("equidistant", FISHEYE)] * 3
 
 
 @pytest.fixture(scope="module")

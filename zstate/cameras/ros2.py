@@ -243,6 +243,7 @@ CAMERA_INFO_STREAM = RosStream(
     encode=encode_camera_info,
     decode=decode_camera_info,
     withdrawn=_WITHDRAWN,
+    uncarried_number="line_time_ns",
     is_withdrawn=_has_no_camera,
     displayed=DisplayedForm(CAMERA_INFO, "camera_info", _is_equidistant, encode_displayed_camera_info),
 )

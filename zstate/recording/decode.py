@@ -16,7 +16,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.plugins import edge_streams, is_value, stream_named, streams_where
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
-from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
+from zstate.recording.encode import NUMBER, POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
 from zstate.streams import StreamName
@@ -36,6 +36,7 @@ from zstate.wire.ros2.streams import (
     has_sensor_topics,
     recorded_forms,
     ros_streams,
+    uncarried_number,
     without_suffix,
 )
 from zstate.wire.ros2.topics import SHARED, FrameNames, name_from_topic, robot_from_topic
@@ -280,8 +281,9 @@ class DecodedRecording:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
         for message in messages:
-            field = channel.uncarried
-            content = with_field(message, field, channel.posed) if field else message
+            content = with_field(message, field, channel.posed) if (field := channel.uncarried) else message
+            if channel.number:
+                content = with_field(content, uncarried_number(writer.stream), channel.number)
             yield DecodedMessage(writer, content, record.log_time)
 
     def records(
@@ -330,6 +332,7 @@ class DecodedRecording:
                     posed and names.to_zstate(posed),
                     json,
                     None if form is None else form.decode,
+                    int(channel.metadata.get(NUMBER, "0")),
                 )
             self._known[channel] = decoder
         return self._known[channel]
@@ -340,7 +343,8 @@ class ChannelDecoder(NamedTuple):
 
     A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS; one of
     poses, those of the frame ``posed``, empty for the base of the robot. ``json`` decodes a channel in JSON,
-    ``decode_form`` one with messages in another form than ROS carries them.
+    ``decode_form`` one with messages in another form than ROS carries them. ``number`` is one of its messages
+    that ROS does not carry.
     """
 
     writer: RecordedWriter
@@ -351,6 +355,7 @@ class ChannelDecoder(NamedTuple):
     posed: str
     json: JsonDecoder | None
     decode_form: Callable[..., Message] | None
+    number: int
 
     @property
     def uncarried(self) -> str:

@@ -54,6 +54,7 @@ from zstate.wire.ros2.streams import (
     displayed_form,
     recorded_forms,
     ros_stream,
+    uncarried_number,
     without_suffix,
 )
 from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys
@@ -81,6 +82,9 @@ TOPICS: dict[StreamName, StreamName] = {"transforms": "tf", "partial_joint_state
 
 POSED_FRAME = "zstate.posed_frame"
 """Channel metadata key of the frame whose measured poses a channel has, as it is named in /tf."""
+
+NUMBER = "zstate.number"
+"""Channel metadata key of the number that ROS does not carry (``RosStream.uncarried_number``)."""
 
 _NAMED = SampleLayout()
 
@@ -350,7 +354,10 @@ class RecordingEncoder:
                     f"it has {MAX_LATCHED} latched messages; that of {edge_writer!r} is one more"
                 )
             form = self._form_of(stream, message)
-            channel = self._channel(robot, stream, session_of(message), log_time, edge_writer, form=form)
+            number: int = getattr(message, uncarried_number(stream), 0)
+            channel = self._channel(
+                robot, stream, session_of(message), log_time, edge_writer, number=number, form=form
+            )
         payload = encode_json(message) if carried_as_json(stream) else channel.encode(message)
         with self._lock:
             # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
@@ -397,13 +404,14 @@ class RecordingEncoder:
         *,
         child: str = "",
         program: str = "",
+        number: int = 0,
         form: DisplayedForm | None = None,
     ) -> ChannelEncoder:
         """The channel of a writer's stream; with ``child`` of the covariances, or measured poses, of it.
 
-        With ``form`` that of its messages of this form.
+        With ``form`` that of its messages of this form; ``number`` is one that ROS does not carry.
         """
-        key = (stream, session, edge_writer, child, form)
+        key = (stream, session, edge_writer, child, number, form)
         opened = self._channels[robot]
         channel = opened.find(key)
         if channel is not None:
@@ -421,6 +429,8 @@ class RecordingEncoder:
         if program:
             metadata["zstate.program"] = program
         topic, kind, qos = self.topic(robot, stream, edge_writer, form)
+        if number:
+            metadata[NUMBER] = str(number)
         if carried_as_json(stream):
             metadata |= {STREAM: stream, VERSION: str(stream_named(stream).version)}
         if child and ros_stream(TOPICS.get(stream, stream)).uncarried:
@@ -428,8 +438,7 @@ class RecordingEncoder:
         elif child:
             metadata[CHILD_FRAME] = in_ros = names.to_ros(child)
             topic, kind = covariance_topic(options.namespace, names.to_zstate(in_ros)), POSE_WITH_COVARIANCE
-        number = self._writer.channel(topic, kind, qos, metadata)
-        channel = ChannelEncoder(number, stream, names, form)
+        channel = ChannelEncoder(self._writer.channel(topic, kind, qos, metadata), stream, names, form)
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)
         return channel

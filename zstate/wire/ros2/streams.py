@@ -40,7 +40,8 @@ class RosStream(NamedTuple):
     in ``RosStreamEncoder`` and ``RosDecoder``. ``suffix`` are the last names of a topic below that of the
     sensor, as cameras have them: /r1/wrist/camera_info. With ``is_of_sensor`` their namespace may be that of
     the sensor: /r1/imu/data is a topic of the robot r1. ``uncarried`` is the field with a frame that ROS does
-    not carry: a recording has a channel for each. ``withdrawn`` is recorded when a latched value is
+    not carry: a recording has a channel for each, and for each value of ``uncarried_number``, a field with an
+    integer of a latched message. ``withdrawn`` is recorded when a latched value is
     withdrawn, which ROS cannot express; ``is_withdrawn`` whether a message is such a one. ``displayed`` is
     the form of some of the messages in recordings and for viewers.
     """
@@ -53,6 +54,7 @@ class RosStream(NamedTuple):
     is_of_sensor: bool = False
     suffix: str = ""
     uncarried: str = ""
+    uncarried_number: str = ""
     withdrawn: Message | None = None
     is_withdrawn: Callable[..., bool] | None = None
     displayed: DisplayedForm | None = None
@@ -151,6 +153,12 @@ def displayed_form(stream: StreamName) -> DisplayedForm | None:
     """The form of some of the messages of ``stream`` in recordings and for viewers, if it has one."""
     carried = ros_streams().get(stream)
     return None if carried is None else carried.displayed
+
+
+def uncarried_number(stream: StreamName) -> str:
+    """The field with a number that ROS does not carry; empty if the messages of ``stream`` have none."""
+    carried = ros_streams().get(stream)
+    return "" if carried is None else carried.uncarried_number
 
 
 def topic_suffix(stream: StreamName) -> str:
