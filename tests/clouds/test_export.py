@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.cli_runner import failure, run_cli
-from helpers.recording_builder import RecordingBuilder
+from helpers.recording_builder import RecordingBuilder, pose
 from rosbags.highlevel import AnyReader
 
 from zstate import Recording
@@ -104,6 +104,30 @@ def test_ply_files_are_read_by_trimesh_with_positions_and_colours(run: Path):
     assert read.vertices[:2].tolist() == [[1.0, 2.0, 4.0], [1.0, 3.0, 5.0]]
     assert read.colors[:2, :3].tolist() == [[255, 128, 1], [1, 2, 3]]
     assert b"property uint t\n" in files[1].read_bytes()  # of stamps of 64 bits PLY has no type
+
+
+def test_points_are_placed_in_a_frame_each_at_its_own_instant(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    with RecordingBuilder(path, "r1") as builder:
+        for number in range(2):
+            stamp = START + number * 10**8
+            message = cloud_to_message(Cloud(stamp, "lidar", points(number)), False)
+            builder.encoder.write_message("r1", message, stamp, "front")
+        for moved in (0, 2):  # 1 m in 1000 ns; after that its pose is not known
+            builder.edges("r1", START + moved * 1000, {("map", "lidar"): pose(float(moved))})
+    output = run_cli("export", str(path), "--stream", "cloud", "--frame", "map").stdout
+    assert "exported 3 rows of cloud" in " ".join(output.split())
+    assert "1 message left out (no pose)" in " ".join(output.split())
+    with path.with_suffix(".cloud.csv").open() as file:
+        rows = [tuple(float(row[name]) for name in "xyz") for row in csv.DictReader(file)]
+    assert rows[:2] == [(0.0, 2.0, 4.0), (2.0, 3.0, 5.0)]
+    assert np.isnan(rows[2]).all()
+    with Recording(path) as recording:
+        assert export_points(recording, "cloud", tmp_path / "points", frame="map") == (1, {"no pose": 1})
+    elsewhere = ("--output", str(tmp_path / "hall.csv"), "--frame", "hall")
+    assert "hall" in failure("export", str(path), "--stream", "cloud", *elsewhere)
+    assert not (tmp_path / "hall.csv").exists()
+    assert "--frame places points" in failure("export", str(path), "--csv", "--frame", "map", code=2)
 
 
 def test_an_existing_folder_is_kept_unless_it_may_be_overwritten(run: Path):

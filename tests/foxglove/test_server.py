@@ -115,6 +115,15 @@ def test_the_queue_of_a_client_has_1024_messages_and_32_mib_at_most(
         assert client.dropped == 1
 
 
+def test_a_cloud_that_is_larger_than_the_queue_is_sent(server: FoxgloveServer):
+    with FoxgloveClient(server.url) as client:
+        client.subscribe("/tf")
+        client.drain()
+        server.send([ServedMessage(TF.number, bytes(40 * 2**20), 1)])
+        client.until(lambda: client.frames.get("/tf"))
+    assert [len(payload) for _, payload in client.frames["/tf"]] == [40 * 2**20]
+
+
 def test_a_slow_client_loses_its_oldest_messages_and_delays_no_other(server: FoxgloveServer):
     payload, total = bytes(40_000), 3 * 1024
     # A client that does not read: its socket has room for a few hundred of these messages.

@@ -49,7 +49,7 @@ ORIGINS = ("https://app.foxglove.dev", "file://")
 BACKLOG = 1024
 """Messages that wait for one client; the oldest are dropped beyond it."""
 BACKLOG_BYTES = 1 << 25
-"""Limit of their bytes, if that is reached first."""
+"""Limit of their bytes, if that is reached first; a cloud that is larger waits alone."""
 
 _MESSAGE = struct.Struct("<BIQ")
 _TIME = struct.Struct("<BQ")
@@ -433,7 +433,7 @@ class _Client:
         else:
             self._samples.append(message)
             self._bytes += len(message.payload)
-            while len(self._samples) > BACKLOG or self._bytes > BACKLOG_BYTES:
+            while len(self._samples) > 1 and (len(self._samples) > BACKLOG or self._bytes > BACKLOG_BYTES):
                 self._bytes -= len(self._samples.popleft().payload)
                 self.dropped += 1
                 self._warn()

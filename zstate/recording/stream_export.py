@@ -37,6 +37,7 @@ from zstate.recording.export import TableFormat, new_table
 from zstate.recording.recording import Recording
 from zstate.streams import StreamName
 from zstate.wire.json_form import json_text
+from zstate.wire.keys import full_name
 from zstate.wire.messages import StampedMessage
 
 _ROWS = 4096
@@ -50,19 +51,29 @@ _PLY_TYPES = {
 
 
 def export_stream(
-    recording: Recording, stream: StreamName, path: Path, kind: TableFormat, *, overwrite: bool = False
+    recording: Recording,
+    stream: StreamName,
+    path: Path,
+    kind: TableFormat,
+    *,
+    frame: str | None = None,
+    overwrite: bool = False,
 ) -> tuple[int, Mapping[str, int]]:
     """Write the messages of ``stream``; returns the number of rows, and of messages left out, by reason.
 
-    The file appears when it is complete. Raises RecordingError and LibraryMissing as ``new_table`` does, and
-    InvalidInput as ``Recording.measurements`` does, for messages with blocks of numbers, without a message,
-    and for an integer beyond 64 bits.
+    With ``frame`` points are placed in it, as ``_placed_in`` does. The file appears when it is complete.
+    Raises RecordingError and LibraryMissing as ``new_table`` does, and InvalidInput as
+    ``Recording.measurements`` does, for messages with blocks of numbers, without a message, and for an
+    integer beyond 64 bits.
     """
     refusals = Refusals(f"recorded {stream}")
     messages = recording.measurements(stream, refuse=refusals.count)
     tables = _tables_of_rows(messages, stream)
     if stream_named(stream).columns:
-        tables = (_with_writer(decoded, columns) for decoded, columns in _tables(messages, stream, refusals))
+        found = _placed_in(frame, recording, _tables(messages, stream, refusals), refusals)
+        tables = (_with_writer(decoded, columns) for decoded, columns in found)
+    elif frame is not None:
+        raise InvalidInput(f"the messages of {stream!r} are no points, and have no place in {frame!r}")
     count, names = 0, list[str]()
     with new_table(path, kind, recording, overwrite=overwrite) as table:
         for columns in tables:
@@ -79,7 +90,12 @@ def export_stream(
 
 
 def export_points(
-    recording: Recording, stream: StreamName, folder: Path, *, overwrite: bool = False
+    recording: Recording,
+    stream: StreamName,
+    folder: Path,
+    *,
+    frame: str | None = None,
+    overwrite: bool = False,
 ) -> tuple[int, Mapping[str, int]]:
     """Write each message of ``stream`` into a file of ``folder``, ROBOT.WRITER.STAMP.ply; returns as above.
 
@@ -93,7 +109,8 @@ def export_points(
     count = 0
     try:
         folder.mkdir(parents=True, exist_ok=overwrite)
-        for decoded, columns in _tables(messages, stream, refusals):
+        tables = _placed_in(frame, recording, _tables(messages, stream, refusals), refusals)
+        for decoded, columns in tables:
             stamp = getattr(decoded.message, "stamp")  # noqa: B009 - of measurements
             name = f"{decoded.writer.robot}.{decoded.writer.edge_writer or stream}.{stamp}.ply"
             write_ply(folder / name, columns)
@@ -130,6 +147,31 @@ def _tables(
             yield decoded, make(decoded.message, decoded.writer.robot)
         except InvalidInput as error:
             refusals.count("malformed", str(error))
+
+
+def _placed_in(
+    frame: str | None,
+    recording: Recording,
+    tables: Iterator[tuple[DecodedMessage, dict[str, NDArray[Any]]]],
+    refusals: Refusals,
+) -> Iterator[tuple[DecodedMessage, dict[str, NDArray[Any]]]]:
+    """``tables`` with x, y, z in ``frame``, each point by the pose of its sensor at its own stamp.
+
+    A point without a pose then is NaN; a cloud of such points only is left out. Without ``frame`` they are as
+    measured. Raises LookupFailed for a frame without a path to that of the sensor.
+    """
+    buffer = None if frame is None else recording.buffer()
+    for decoded, columns in tables:
+        if frame is not None and buffer is not None:
+            own: str = getattr(decoded.message, "frame")  # noqa: B009 - of points
+            points = np.stack([columns[name] for name in "xyz"], axis=-1)
+            source = full_name(decoded.writer.robot, own)
+            placed, valid = buffer.place(points, columns["stamp"], source, frame)
+            if not valid.any():
+                refusals.count("no pose", f"{source!r} has no pose in {frame!r} at the stamps of a cloud")
+                continue
+            columns |= dict(zip("xyz", placed.T, strict=True))
+        yield decoded, columns
 
 
 def _with_writer(decoded: DecodedMessage, columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -67,6 +67,9 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
     metavar="NAME",
     help="Instead: the messages of a stream of measurements, one row each; of clouds a row for each point.",
 )
+@click.option(
+    "--frame", metavar="FRAME", help="Place the points of --stream in FRAME, each at its own instant."
+)
 @click.option("--csv", "kind", flag_value="csv", help="Write comma-separated values.")
 @click.option("--parquet", "kind", flag_value="parquet", help="Write Parquet.")
 @click.option("--ply", "kind", flag_value="ply", help="Write each cloud of --stream as PLY, into a folder.")
@@ -93,6 +96,7 @@ def export_command(
     rate: float | None,
     stamps: NDArray[np.int64] | None,
     stream: str | None,
+    frame: str | None,
     kind: TableFormat | Literal["ply"] | None,
     lerobot: str | None,
     fps: int | None,
@@ -125,10 +129,11 @@ def export_command(
     zstate export run.mcap --stream battery                  # run.battery.csv
     zstate export run.mcap --stream cloud --parquet          # run.cloud.parquet, a row for each point
     zstate export run.mcap --stream cloud --ply              # run.cloud.ply/diffbot.lidar.STAMP.ply
+    zstate export run.mcap --stream cloud --ply --frame map  # all of them in one frame
     zstate export ep1.mcap ep2.mcap --lerobot stack --task "stack the cubes"
     """
     if lerobot is not None:
-        if poses or rate is not None or stamps is not None or stream or kind or output:
+        if poses or rate is not None or stamps is not None or stream or frame or kind or output:
             raise click.UsageError(
                 "--lerobot writes a folder of its own, without --pose, --rate, --stamps, --stream, --output "
                 "and the other formats"
@@ -145,8 +150,10 @@ def export_command(
             raise click.UsageError(
                 "--stream exports messages as recorded, without --pose, --rate and --stamps"
             )
-        _export_stream(file, robot, stream, kind or "csv", output, overwrite=overwrite)
+        _export_stream(file, robot, stream, kind or "csv", output, frame=frame, overwrite=overwrite)
         return
+    if frame is not None:
+        raise click.UsageError("--frame places points: name their stream, such as --stream cloud")
     if kind is None:
         raise click.UsageError("Missing option '--csv' or '--parquet'.")
     if kind == "ply":
@@ -177,6 +184,7 @@ def _export_stream(
     kind: TableFormat | Literal["ply"],
     output: str | None,
     *,
+    frame: str | None,
     overwrite: bool,
 ) -> None:
     from zstate.errors import RecordingError
@@ -188,9 +196,11 @@ def _export_stream(
     with Recording(file, robot) as recording:
         try:
             if kind == "ply":
-                count, refused = export_points(recording, stream, path, overwrite=overwrite)
+                count, refused = export_points(recording, stream, path, frame=frame, overwrite=overwrite)
             else:
-                count, refused = export_stream(recording, stream, path, kind, overwrite=overwrite)
+                count, refused = export_stream(
+                    *(recording, stream, path, kind), frame=frame, overwrite=overwrite
+                )
         except RecordingError as error:
             fail(str(error).replace("overwrite=True", "--overwrite"))
     items = count_text(
