@@ -361,4 +361,6 @@ def _lost(stats: RecorderStats) -> str:
         (stats.unwritten, "without a description that fits"),
         (sum(stats.refused.values()), f"refused ({reasons})"),
     )
-    return ", ".join(f"{count} {what}" for count, what in parts if count)
+    lost = ", ".join(f"{count} {what}" for count, what in parts if count)
+    of = ", ".join(f"{count} of {robot} {stream}" for (robot, stream), count in sorted(stats.missing.items()))
+    return f"{lost} ({of})" if of else lost
