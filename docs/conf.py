@@ -87,7 +87,7 @@ PAGES = {
 # Types of other projects: their inventories are on other hosts, and the build makes no requests.
 _NUMPY = "https://numpy.org/doc/stable/reference"
 _ZENOH = "https://zenoh-python.readthedocs.io/en/latest/api_reference.html"
-_SCALARS = ("bool", "float32", "float64", "int8", "int64", "uint8")
+_SCALARS = ("bool", "float32", "float64", "int8", "int64", "uint8", "void")
 ELSEWHERE = {
     **{f"numpy.{name}": f"{_NUMPY}/generated/numpy.{name}.html" for name in ("dtype", "ndarray")},
     **{f"numpy.{name}": f"{_NUMPY}/arrays.scalars.html#numpy.{name}" for name in _SCALARS},
