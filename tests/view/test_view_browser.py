@@ -13,6 +13,7 @@ from helpers.processes import DEADLINE_S, repeated, until
 from numpy.typing import NDArray
 
 from zstate import StatePublisher, Transform, load_model
+from zstate.clouds import CloudPublisher
 from zstate.model.geometry import read_shapes
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
@@ -295,6 +296,39 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         view_tab.save_screenshot("map")
         for place in (unknown, free):
             assert min(lightness(place)) > 180
+
+
+def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_view, sessions):
+    # A wall of points a millimetre apart, 0.2 x 0.2 m, beside the arm.
+    across, up = np.meshgrid(np.linspace(0.5, 0.7, 200), np.linspace(0.5, 0.7, 200))
+    points = np.stack([np.zeros(across.size), across.ravel(), up.ravel()], axis=1)
+    middle = np.array([[0.0, 0.6, 0.6]])
+    with (
+        standing(sessions[0], "rrbot"),
+        CloudPublisher(sessions[0], "rrbot", "lidar", frame="world") as lidar,
+        repeated(lambda: lidar.publish(points), every_s=0.1),
+    ):
+        shown = show_view(sessions[1], "rrbot")
+        clouds = shown.view.scene.clouds
+        until(lambda: "rrbot" in shown.source.models and clouds.has_any)
+        view_tab = open_tab(shown.page.url)
+        until_fitted(shown)
+        snapshot = shown.source.snapshot()
+        placed = snapshot.poses_in("rrbot/world")
+        framing = fit_camera(snapshot, placed, 1.0, shown.view.scene.corners(snapshot.tree, placed))
+        assert framing is not None
+        height, width = shape_of(view_tab)
+        ((x, y),) = pixels_of(middle, framing, (width, height)).round().astype(int).tolist()
+
+        def is_drawn() -> bool:
+            pixel = view_tab.pixels()[y, x].astype(int)
+            return pixel.max() - pixel.min() > 60  # coloured
+
+        until(is_drawn, PATIENCE_S)
+        view_tab.save_screenshot("cloud")
+        field(view_tab, "Draw clouds").click()
+        until(lambda: not clouds.is_on)
+        until(lambda: not is_drawn(), PATIENCE_S)
 
 
 def test_map_without_any_frame_is_drawn_in_its_own(open_tab, show_view, sessions):

@@ -163,6 +163,7 @@ class View(Closeable):
                     poses = self.scene.show(snapshot, fixed) if snapshot.tree.names else _NO_POSES
                     place = DrawnFrames(snapshot.tree, poses, fixed)
                     self.scene.world.show(self._source.world, self._source.buffer, place, at)
+                    self.scene.clouds.show(self._source.world, self._source.buffer, place, at)
                     self.scene.odometry.show(self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
