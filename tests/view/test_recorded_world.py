@@ -6,19 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.pictures import jpeg
 from helpers.recording_builder import MS, START, RecordingBuilder, S, pose
 
+from zstate.cameras import Camera
+from zstate.cameras.camera import camera_to_message
+from zstate.cameras.messages import CompressedImage
 from zstate.clouds.cloud import Cloud, cloud_to_message
 from zstate.clouds.messages import PointCloud
 from zstate.scans import Scan
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.data_source import ViewSource
-from zstate.view.recorded_world import LogTimes, RecordedMap, RecordedSensor
+from zstate.view.recorded_world import LogTimes, RecordedSensor, RecordedValue
 from zstate.view.world_source import WriterName
 from zstate.wire.messages import to_block, to_float32_block
 
 FRONT, FLOOR = WriterName("cart", "front"), WriterName("hall", "floor")
-TOP = WriterName("cart", "top")
+TOP, WRIST = WriterName("cart", "top"), WriterName("cart", "wrist")
 RAY_NS = 1000
 COUNT = 100
 """Scans of each sensor, 100 ms apart: more than are read together."""
@@ -170,6 +174,30 @@ def test_recorded_clouds_are_read_again_for_more_points(with_clouds: ViewSource)
     assert counts() == [40, 40, 40]
 
 
+def test_recorded_pictures_and_calibrations_are_those_of_the_instant(tmp_path: Path):
+    path = tmp_path / "pictures.mcap"
+    camera, small = (Camera(w, 48, (60.0, 60.0, 31.5, 23.5), frame="lens") for w in (64, 80))
+    with RecordingBuilder(path) as builder:
+        builder.encoder.write_message("cart", camera_to_message(camera, START), START, "wrist")
+        for n in range(20):
+            stamp = START + n * 100 * MS
+            builder.edges("cart", stamp, {("base", "lens"): pose(n)})
+            image = CompressedImage(stamp, n, 1, "lens", "jpeg", jpeg(brightness=5 * n))
+            builder.encoder.write_message("cart", image, stamp + MS, "wrist")
+            if n == 10:
+                builder.encoder.write_message(
+                    "cart", camera_to_message(small, stamp), stamp + 2 * MS, "wrist"
+                )
+    with ViewSource.from_recording(path) as source:
+        world = source.world
+        for n in (3, 19, 0, 12):
+            at = START + n * 100 * MS
+            (packet,) = world.pictures[WRIST].latest(1, at)
+            assert packet.data == jpeg(brightness=5 * n)
+            assert packet.frame == "cart/lens"
+            assert world.cameras_at(at + 50 * MS)[WRIST].width == (64 if n < 10 else 80)
+
+
 def indexed(*stamps: int) -> RecordedSensor:
     scans = [Scan(stamp, 0.0, 0.5, 0, [1.0], 0.1, 10.0, "laser") for stamp in stamps]
     recorded = RecordedSensor(lambda begin, end: iter(scans[begin:end]))
@@ -214,7 +242,7 @@ def test_log_time_is_interpolated_and_begins_again_with_the_clock():
 
 def test_map_is_read_once_while_it_is_in_effect():
     reads: list[int] = []
-    recorded = RecordedMap(reads.append)
+    recorded = RecordedValue(reads.append)
     for log_time, is_withdrawn in ((10, False), (20, True), (30, False)):
         recorded.add(log_time, is_withdrawn=is_withdrawn)
     for log_time in (5, 10, 19, 20, 29, 30, 99, None, 15):

@@ -12,7 +12,8 @@ import pytest
 from helpers.processes import DEADLINE_S, repeated, until
 from numpy.typing import NDArray
 
-from zstate import StatePublisher, Transform, load_model
+from zstate import StatePublisher, StaticPublisher, Transform, load_model
+from zstate.cameras import Camera, CameraPublisher
 from zstate.clouds import CloudPublisher
 from zstate.model.geometry import read_shapes
 from zstate.model.urdf import parse_urdf
@@ -329,6 +330,39 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
         field(view_tab, "Draw clouds").click()
         until(lambda: not clouds.is_on)
         until(lambda: not is_drawn(), PATIENCE_S)
+
+
+def test_picture_is_shown_in_the_tab_and_on_the_frustum(open_tab, show_view, sessions):
+    # A red picture, seen from behind the arm by a camera that looks along y of the world.
+    red = np.tile(np.array([200, 20, 20], np.uint8), (48, 64, 1))
+    camera = Camera(64, 48, (60.0, 60.0, 31.5, 23.5), frame="lens")
+    turn = (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+    with (
+        standing(sessions[0], "rrbot"),
+        StaticPublisher(sessions[0], "rrbot", "mount") as mount,
+        CameraPublisher(sessions[0], "rrbot", "wrist", camera) as publisher,
+        repeated(lambda: publisher.publish(red), every_s=0.1),
+    ):
+        mount.set(Transform("world", "lens", (0.5, 0.0, 1.0), turn))
+        shown = show_view(sessions[1], "rrbot")
+        until(lambda: "rrbot" in shown.source.models and shown.view.scene.cameras.shown)
+        view_tab = open_tab(shown.page.url)
+        until_fitted(shown)
+        height, width = shape_of(view_tab)
+
+        def red_parts() -> tuple[bool, bool]:
+            """Whether there is red in the scene, and in the panels."""
+            pixels = view_tab.pixels().astype(int)
+            is_red = (pixels[:, :, 0] > 150) & (pixels[:, :, 1:].max(axis=2) < 60)
+            return is_red[:height, : width - 20].sum() > 200, is_red[:, width:].sum() > 2000
+
+        view_tab.text("Cameras", exact=True).click()
+        until(lambda: all(red_parts()), PATIENCE_S)
+        view_tab.text("64 x 48 jpeg")
+        view_tab.save_screenshot("picture")
+        field(view_tab, "Frustums").click()
+        until(lambda: not shown.view.scene.cameras.frustums)
+        until(lambda: red_parts() == (False, True), PATIENCE_S)
 
 
 def test_map_without_any_frame_is_drawn_in_its_own(open_tab, show_view, sessions):

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.cameras import Camera
+from zstate.cameras.camera import camera_to_message
 from zstate.clouds.cloud import Cloud, cloud_to_message
 from zstate.net.subscription import Received
 from zstate.scans import Scan
@@ -185,3 +187,18 @@ def test_cloud_with_impossible_times_is_refused():
     with WorldSource(None) as source:
         source._on_clouds([Received("r1", "zstate/r1/cloud/top", message)])
         assert (dict(source.clouds), source.refused) == ({}, {"malformed cloud": 1})
+
+
+def test_calibration_of_a_camera_replaces_the_one_before_and_is_withdrawn():
+    key = "zstate/r1/camera_info/wrist"
+
+    def receive(source: WorldSource, width: int) -> None:
+        camera = Camera(width, 48, (60.0, 60.0, 31.5, 23.5))
+        source._on_cameras([Received("r1", key, camera_to_message(camera, 1))])
+
+    with WorldSource(None) as source:
+        receive(source, 64)
+        receive(source, 80)
+        assert source.cameras_at()[WriterName("r1", "wrist")].width == 80
+        source._on_camera_withdrawn(key)
+        assert source.cameras_at() == {}

@@ -1,4 +1,4 @@
-"""Scans, clouds and maps to draw, from a recording.
+"""Scans, clouds, pictures and maps to draw, from a recording.
 
 They stay in the file: a lidar writes more than all joints of a robot together. ``RecordedWorld`` indexes them
 once, while the poses are loaded, and reads those around the instant on display.
@@ -12,13 +12,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Generic
+from typing import Generic, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import TimeSpan
+from zstate.cameras.camera import Camera, camera_from_message
+from zstate.cameras.messages import CameraInfo, CompressedImage
+from zstate.cameras.plugin import CAMERA_INFO, IMAGE
 from zstate.clouds.cloud import Cloud, cloud_from_message
 from zstate.clouds.messages import PointCloud
 from zstate.clouds.plugin import CLOUD
@@ -31,20 +34,23 @@ from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.streams import StreamName
+from zstate.view.pictures import Packet, packet_from_message
 from zstate.view.thinned_cloud import ThinnedCloud, thinned_cloud
 from zstate.view.world_source import CLOUD_POINTS, TIME_JUMP_NS, M, Measured, WriterName
 from zstate.wire.messages import Message
 
 _SCANS_AHEAD = 30
 """Scans that are read together: a second of most sensors."""
-_CLOUDS_AHEAD = 3
-"""Clouds that are read together: one takes milliseconds."""
+_FEW_AHEAD = 3
+"""Clouds and pictures that are read together: one takes milliseconds."""
 _COMPARED_NS = 1_000_000_000
 """Stamps and log times of a recording are compared so often."""
 
+V = TypeVar("V")
+
 
 class RecordedSensor(Generic[M]):
-    """The scans or clouds of one sensor in a recording, by the stamps of their ends.
+    """The scans, clouds or pictures of one sensor in a recording, by the stamps of their ends.
 
     One that is not newer than the one before is left out; one that is more than a second older begins again,
     as the poses do when a clock was set back. ``read(begin, end)`` yields those with log times [ns] in
@@ -63,7 +69,7 @@ class RecordedSensor(Generic[M]):
         """By row of the index."""
 
     def add(self, measured: Measured, log_time: int) -> None:
-        """Index the next scan or cloud of the recording."""
+        """Index the next one of the recording."""
         if self._ends and measured.end_stamp <= self._ends[-1]:
             if measured.end_stamp >= self._ends[-1] - TIME_JUMP_NS:
                 return
@@ -128,27 +134,27 @@ class RecordedSensor(Generic[M]):
         self._loaded = loaded
 
 
-class RecordedMap:
-    """The maps of one writer in a recording, each in effect until the next.
+class RecordedValue(Generic[V]):
+    """The maps of one writer, or the calibrations of a camera, each in effect until the next.
 
-    ``read(log_time)`` returns the map that was recorded at a log time [ns].
+    ``read(log_time)`` returns the one that was recorded at a log time [ns].
     """
 
-    def __init__(self, read: Callable[[int], Grid | None]) -> None:
+    def __init__(self, read: Callable[[int], V | None]) -> None:
         self._read = read
         self._log_times: list[int] = []
         self._withdrawn: set[int] = set()
-        self._loaded: tuple[int, Grid | None] = -1, None
-        """The row of the map that was read last, and that map."""
+        self._loaded: tuple[int, V | None] = -1, None
+        """The row that was read last, and its value."""
 
     def add(self, log_time: int, *, is_withdrawn: bool) -> None:
-        """Index the next change of the map."""
+        """Index the next change."""
         if is_withdrawn:
             self._withdrawn.add(len(self._log_times))
         self._log_times.append(log_time)
 
-    def at(self, log_time: int | None) -> Grid | None:
-        """The map in effect at ``log_time`` [ns], or at the end; None if there is none."""
+    def at(self, log_time: int | None) -> V | None:
+        """The one in effect at ``log_time`` [ns], or at the end; None if there is none."""
         row = (len(self._log_times) if log_time is None else bisect_right(self._log_times, log_time)) - 1
         if row < 0 or row in self._withdrawn:
             return None
@@ -191,7 +197,7 @@ class LogTimes:
 
 
 class RecordedWorld(Closeable):
-    """The scans, clouds and maps of all robots in the recording at ``path``, at any instant of it.
+    """The scans, clouds, pictures and maps of all robots in the recording at ``path``, at any instant of it.
 
     Call ``add`` with each message before anything is drawn. One thread draws; another may close.
     Raises RecordingError if the recording cannot be read.
@@ -200,35 +206,40 @@ class RecordedWorld(Closeable):
     problems: Sequence[tuple[str, str]] = ()
 
     def __init__(self, path: str | Path) -> None:
-        self._refusals = Refusals("recorded scans, clouds and maps")
+        self._refusals = Refusals("recorded scans, clouds, pictures and maps")
         self._reader = RecordingReader(path)
         self._recording = DecodedRecording(self._reader, self._refusals.count)
         self._lock = fork_safe_lock()
         self._is_open = True
         self._log_times = LogTimes()
         self._latched = LatchedState()
-        self._maps: dict[WriterName, RecordedMap] = {}
+        self._maps: dict[WriterName, RecordedValue[Grid]] = {}
+        self._cameras: dict[WriterName, RecordedValue[Camera]] = {}
+        self.pictures: dict[WriterName, RecordedSensor[Packet]] = {}
         self.sensors: dict[WriterName, RecordedSensor[Scan]] = {}
         self.clouds: dict[WriterName, RecordedSensor[ThinnedCloud]] = {}
         self._cloud_limits: dict[WriterName, int] = {}
 
     @property
     def span(self) -> TimeSpan | None:
-        """The stamps of all scans and clouds; None without any."""
-        spans = [sensor.span for sensor in (*self.sensors.values(), *self.clouds.values())]
+        """The stamps of all scans, clouds and pictures; None without any."""
+        measured = *self.sensors.values(), *self.clouds.values(), *self.pictures.values()
+        spans = [sensor.span for sensor in measured]
         if not spans:
             return None
         return TimeSpan(min(one.oldest for one in spans), max(one.newest for one in spans))
 
     def add(self, decoded: DecodedMessage, buffer: TransformBuffer) -> None:
         """Index the next message of the recording, which ``buffer`` has."""
-        is_map = isinstance(decoded.message, OccupancyGrid) and self._add_map(decoded)
+        is_value = isinstance(decoded.message, (OccupancyGrid, CameraInfo)) and self._add_value(decoded)
         if isinstance(decoded.message, LaserScan):
             self._add_scan(decoded)
         if isinstance(decoded.message, PointCloud):
             self._add_cloud(decoded)
+        if isinstance(decoded.message, CompressedImage):
+            self._add_picture(decoded)
         due = self._log_times.due
-        if (is_map or due is None or decoded.log_time >= due) and (span := buffer.span()) is not None:
+        if (is_value or due is None or decoded.log_time >= due) and (span := buffer.span()) is not None:
             self._log_times.add(span.newest, decoded.log_time)
 
     def _add_scan(self, decoded: DecodedMessage) -> None:
@@ -242,7 +253,7 @@ class RecordedWorld(Closeable):
         cloud, name = self._to_cloud(decoded), _name(decoded)
         if cloud is not None:
             if name not in self.clouds:
-                self.clouds[name] = RecordedSensor(partial(self._read_clouds, name), _CLOUDS_AHEAD)
+                self.clouds[name] = RecordedSensor(partial(self._read_clouds, name), _FEW_AHEAD)
             self.clouds[name].add(cloud, decoded.log_time)
 
     def limit_clouds(self, name: WriterName, points: int) -> None:
@@ -251,22 +262,40 @@ class RecordedWorld(Closeable):
             self.clouds[name].read_again()
         self._cloud_limits[name] = points
 
-    def _add_map(self, decoded: DecodedMessage) -> bool:
-        """Returns whether the map has changed: it is repeated for readers that start in the middle."""
+    def _add_picture(self, decoded: DecodedMessage) -> None:
+        assert isinstance(decoded.message, CompressedImage)
+        name = _name(decoded)
+        if name not in self.pictures:
+            self.pictures[name] = RecordedSensor(partial(self._read_pictures, name), _FEW_AHEAD)
+        self.pictures[name].add(packet_from_message(decoded.message, name.robot), decoded.log_time)
+
+    def _add_value(self, decoded: DecodedMessage) -> bool:
+        """Returns whether it has changed: it is repeated for readers that start in the middle."""
         if self._latched.update(decoded) is None:
             return False
-        name = _name(decoded)
-        if name not in self._maps:
-            self._maps[name] = RecordedMap(partial(self._read_map, name))
-        assert isinstance(decoded.message, OccupancyGrid)
-        self._maps[name].add(decoded.log_time, is_withdrawn=not decoded.message.cells)
+        name, message = _name(decoded), decoded.message
+        if isinstance(message, OccupancyGrid):
+            maps = self._maps.setdefault(name, RecordedValue(partial(self._read_map, name)))
+            maps.add(decoded.log_time, is_withdrawn=not message.cells)
+        if isinstance(message, CameraInfo):
+            cameras = self._cameras.setdefault(name, RecordedValue(partial(self._read_camera, name)))
+            cameras.add(decoded.log_time, is_withdrawn=not message.is_calibrated)
         return True
 
     def maps_at(self, at: int | None) -> Mapping[WriterName, Grid]:
         """The maps in effect ``at`` a stamp [ns]; None: at the end."""
+        return self._in_effect(self._maps, at)
+
+    def cameras_at(self, at: int | None) -> Mapping[WriterName, Camera]:
+        """The calibrations in effect ``at`` a stamp [ns]; None: at the end."""
+        return self._in_effect(self._cameras, at)
+
+    def _in_effect(
+        self, values: Mapping[WriterName, RecordedValue[V]], at: int | None
+    ) -> Mapping[WriterName, V]:
         log_time = None if at is None else self._log_times.log_time(at)
-        grids = {name: maps.at(log_time) for name, maps in self._maps.items()}
-        return {name: grid for name, grid in grids.items() if grid is not None}
+        found = {name: value.at(log_time) for name, value in values.items()}
+        return {name: value for name, value in found.items() if value is not None}
 
     def _read_scans(self, name: WriterName, begin: int, end: int) -> Iterator[Scan]:
         for decoded in self._messages(name, SCAN.name, begin, end):
@@ -279,6 +308,21 @@ class RecordedWorld(Closeable):
             cloud = self._to_cloud(decoded)
             if cloud is not None:
                 yield thinned_cloud(cloud, self._cloud_limits.get(name, CLOUD_POINTS))
+
+    def _read_pictures(self, name: WriterName, begin: int, end: int) -> Iterator[Packet]:
+        for decoded in self._messages(name, IMAGE.name, begin, end):
+            assert isinstance(decoded.message, CompressedImage)
+            yield packet_from_message(decoded.message, name.robot)
+
+    def _read_camera(self, name: WriterName, log_time: int) -> Camera | None:
+        info: Message | None = None
+        for decoded in self._messages(name, CAMERA_INFO.name, log_time, log_time + 1):
+            info = decoded.message
+        try:
+            return camera_from_message(info, name.robot) if isinstance(info, CameraInfo) else None
+        except InvalidInput as error:
+            self._refusals.count("malformed calibration", f"{name}: {error}")
+            return None
 
     def _read_map(self, name: WriterName, log_time: int) -> Grid | None:
         grid: Message | None = None

@@ -1,4 +1,4 @@
-"""Scans, clouds and maps to draw, from the network."""
+"""Scans, clouds, pictures and maps to draw, from the network."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import TimeSpan
+from zstate.cameras.camera import Camera, camera_from_message
+from zstate.cameras.messages import CameraInfo, CompressedImage
+from zstate.cameras.plugin import CAMERA_INFO, IMAGE
 from zstate.clouds.cloud import cloud_from_message
 from zstate.clouds.messages import PointCloud
 from zstate.clouds.plugin import CLOUD
@@ -28,6 +31,7 @@ from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
+from zstate.view.pictures import Packet, packet_from_message
 from zstate.view.thinned_cloud import ThinnedCloud, thinned_cloud
 from zstate.wire.keys import ANY, shortened
 from zstate.wire.registry import get_wire
@@ -40,6 +44,8 @@ _SCAN_BYTES = 4_000_000
 """Of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
 _CLOUD_BYTES = 128_000_000
 """Of the waiting and of the kept clouds of one sensor: 4 million points with intensity, ring and time."""
+_PICTURE_BYTES = 64_000_000
+"""Of the pictures of one camera: 500 of 720 rows."""
 CLOUD_POINTS = 200_000
 """The points that are kept of each cloud of a sensor without a limit of its own."""
 _MAX_WRITERS = 64
@@ -47,13 +53,15 @@ _UNKNOWN_S = 10.0
 """How long a sensor may be silent after its first scan."""
 _TOO_MANY_SENSORS = "too many sensors"
 _TOO_MANY_CLOUDS = "too many sensors of clouds"
+_TOO_MANY_CAMERAS = "too many cameras"
 _TOO_MANY_MAPS = "too many maps"
 _FURTHER = {
     _TOO_MANY_SENSORS: "scans of further sensors",
     _TOO_MANY_CLOUDS: "clouds of further sensors",
+    _TOO_MANY_CAMERAS: "pictures of further cameras",
     _TOO_MANY_MAPS: "further maps",
 }
-WORLD_STREAMS = SCAN.name, CLOUD.name, MAP.name
+WORLD_STREAMS = SCAN.name, CLOUD.name, IMAGE.name, CAMERA_INFO.name, MAP.name
 """What surrounds robots."""
 
 TIME_JUMP_NS = 1_000_000_000
@@ -61,7 +69,7 @@ TIME_JUMP_NS = 1_000_000_000
 
 
 class Measured(Protocol):
-    """A scan or a cloud: what a sensor measured in ``frame`` from ``stamp`` to ``end_stamp`` [ns]."""
+    """A scan, a cloud or a picture: measured in ``frame`` from ``stamp`` to ``end_stamp`` [ns]."""
 
     @property
     def stamp(self) -> int: ...
@@ -91,7 +99,7 @@ class WriterName(NamedTuple):
 
 
 class Sensor(Protocol[M_co]):
-    """The scans or clouds of one sensor, as they are drawn. ``problem`` is why some are not, if any."""
+    """What one sensor measured, as it is drawn. ``problem`` is why some of it is not, if any."""
 
     @property
     def frame(self) -> str | None:
@@ -119,7 +127,7 @@ class Sensor(Protocol[M_co]):
 
 
 class WorldData(Protocol):
-    """What is around the robots, as it is drawn: scans, clouds and maps.
+    """What is around the robots, as it is drawn: scans, clouds, pictures and maps.
 
     ``problems`` are what cannot be drawn at all, with the reason.
     """
@@ -135,11 +143,18 @@ class WorldData(Protocol):
         ...
 
     @property
+    def pictures(self) -> Mapping[WriterName, Sensor[Packet]]: ...
+
+    def cameras_at(self, at: int | None) -> Mapping[WriterName, Camera]:
+        """The calibration of each camera ``at`` a stamp [ns]; None: the newest."""
+        ...
+
+    @property
     def problems(self) -> Sequence[tuple[str, str]]: ...
 
     @property
     def span(self) -> TimeSpan | None:
-        """The stamps of all scans and clouds; None if they are only drawn as they arrive."""
+        """The stamps of all scans, clouds and pictures; None if they are only drawn as they arrive."""
         ...
 
     def maps_at(self, at: int | None) -> Mapping[WriterName, Grid]:
@@ -151,7 +166,9 @@ class WorldData(Protocol):
 
 @dataclass(eq=False)
 class LiveSensor(Generic[M]):
-    """The scans or clouds of one sensor: those that wait for the pose of their end, and the last with it.
+    """What one sensor measured: scans or clouds that wait for the pose of their end, and the last with it.
+
+    Pictures wait for nothing.
 
     ``dropped`` counts those whose pose did not come within a second, or before too many others waited.
     ``reason`` is why the newest one was dropped, None if it was kept; one that still waits does not count.
@@ -185,6 +202,12 @@ class LiveSensor(Generic[M]):
         """Whether the sensor has missed its deadline, at present."""
         return self._deadline.is_missed(self.clock())
 
+    def keep(self, measured: M) -> None:
+        """Keep what has arrived, and needs no pose."""
+        self._deadline.on_sample(self.clock())
+        with self._lock:
+            self._append(measured)
+
     @property
     def received_s(self) -> float:
         """When the newest one arrived, by ``clock``."""
@@ -214,7 +237,8 @@ class LiveSensor(Generic[M]):
             if self._remove_first(waiting, is_dropped=reason is not None):
                 self.reason = reason
                 if reason is None:
-                    self._keep(measured)
+                    with self._lock:
+                        self._append(measured)
 
     def _first_waiting(self) -> tuple[M, float] | None:
         with self._lock:
@@ -229,35 +253,45 @@ class LiveSensor(Generic[M]):
             self.dropped += is_dropped
         return True
 
-    def _keep(self, measured: M) -> None:
+    def _append(self, measured: M) -> None:
         if self._kept and measured.stamp < self._kept[-1].stamp - TIME_JUMP_NS:
             self._kept.clear()  # the clock was set back, or a replay has begun again
         self._kept.append(measured, measured.nbytes)
 
     def latest(self, count: int, at: int | None = None) -> Sequence[M]:
         """The last ``count`` that ended until ``at`` [ns]; None: of all. The oldest first."""
-        return [*islice(self._until(at), count)][::-1]
+        with self._lock:
+            return [*islice(self._until(at), count)][::-1]
 
     def within(self, window_ns: int, at: int | None = None) -> Sequence[M]:
         """The last one until ``at`` [ns], and those that ended at most ``window_ns`` before it."""
-        newest = next(self._until(at), None)
-        if newest is None:
-            return ()
-        begin = newest.end_stamp - window_ns
-        return [*takewhile(lambda one: one.end_stamp >= begin, self._until(at))][::-1]
+        with self._lock:
+            newest = next(self._until(at), None)
+            if newest is None:
+                return ()
+            begin = newest.end_stamp - window_ns
+            return [*takewhile(lambda one: one.end_stamp >= begin, self._until(at))][::-1]
 
     def _until(self, at: int | None) -> Iterator[M]:
         """Those that ended until ``at``, the newest first."""
         return (one for one in reversed(self._kept) if at is None or one.end_stamp <= at)
 
 
-class WorldSource(Closeable):
-    """Receives the scans and clouds of all robots, or of ``robots`` only, and all maps.
+class _SensorTable(dict[WriterName, LiveSensor[M]]):
+    """The sensors of one stream; ``too_many`` is why another is refused, ``max_bytes`` are those of each."""
 
-    Without a ``session`` it receives nothing. ``maps``, ``sensors`` and ``clouds`` are by the names of their
-    writers; a map that is withdrawn is removed from ``maps``, and the longest stale sensor when there are
-    more than 64. ``refused`` counts messages that are no scan, cloud or map, or for which there is no room,
-    by reason; the first of each is logged.
+    def __init__(self, too_many: str, max_bytes: int) -> None:
+        super().__init__()
+        self.too_many, self.max_bytes = too_many, max_bytes
+
+
+class WorldSource(Closeable):
+    """Receives the scans, clouds and pictures of all robots, or of ``robots`` only, and all maps.
+
+    Without a ``session`` it receives nothing. ``maps``, ``sensors``, ``clouds`` and ``pictures`` are by the
+    names of their writers; a map that is withdrawn is removed from ``maps``, and the longest stale sensor
+    when there are more than 64. ``refused`` counts messages that are none of these, or for which there is no
+    room, by reason; the first of each is logged.
     """
 
     def __init__(
@@ -272,9 +306,11 @@ class WorldSource(Closeable):
         self._selected = frozenset(robots)
         self._wire = get_wire(wire)
         self._lock = fork_safe_lock()
-        self._sensors: dict[WriterName, LiveSensor[Scan]] = {}
-        self._clouds: dict[WriterName, LiveSensor[ThinnedCloud]] = {}
+        self._sensors = _SensorTable[Scan](_TOO_MANY_SENSORS, _SCAN_BYTES)
+        self._clouds = _SensorTable[ThinnedCloud](_TOO_MANY_CLOUDS, _CLOUD_BYTES)
         self._cloud_limits: dict[WriterName, int] = {}
+        self._pictures = _SensorTable[Packet](_TOO_MANY_CAMERAS, _PICTURE_BYTES)
+        self._cameras: dict[str, tuple[WriterName, Camera]] = {}
         self._maps: dict[str, tuple[WriterName, Grid]] = {}
         self._refusals = Refusals()
         self.refused: Mapping[str, int] = self._refusals.counts
@@ -286,6 +322,20 @@ class WorldSource(Closeable):
                 opening.enter_context(scans)
                 clouds = subscribe(session, self._wire, robot, CLOUD.name, self._on_clouds, on_error=count)
                 opening.enter_context(clouds)
+                pictures = subscribe(
+                    session, self._wire, robot, IMAGE.name, self._on_pictures, on_error=count
+                )
+                opening.enter_context(pictures)
+                cameras = subscribe(
+                    session,
+                    self._wire,
+                    robot,
+                    CAMERA_INFO.name,
+                    self._on_cameras,
+                    on_error=count,
+                    on_withdrawn=self._on_camera_withdrawn,
+                )
+                opening.enter_context(cameras)
                 maps = subscribe(
                     session,
                     self._wire,
@@ -342,7 +392,9 @@ class WorldSource(Closeable):
             except InvalidInput as error:
                 self._refusals.count("malformed scan", f"{shortened(key)}: {error}")
                 continue
-            self._add(key, self._sensors, self._writer(robot, key), scan)
+            sensor = self._sensor_of(key, self._sensors, self._writer(robot, key))
+            if sensor is not None:
+                sensor.add(scan)
 
     def _on_clouds(self, received: list[Received]) -> None:
         for robot, key, message in received:
@@ -356,32 +408,66 @@ class WorldSource(Closeable):
             except InvalidInput as error:
                 self._refusals.count("malformed cloud", f"{shortened(key)}: {error}")
                 continue
-            self._add(key, self._clouds, name, cloud)
+            sensor = self._sensor_of(key, self._clouds, name)
+            if sensor is not None:
+                sensor.add(cloud)
 
-    def _add(self, key: str, sensors: dict[WriterName, LiveSensor[M]], name: WriterName, measured: M) -> None:
-        sensor = self._sensor_of(sensors, name)
-        if sensor is not None:
-            sensor.add(measured)
-            return
+    @property
+    def pictures(self) -> Mapping[WriterName, LiveSensor[Packet]]:
+        """The pictures of each camera."""
+        with self._lock:
+            return dict(self._pictures)
+
+    def cameras_at(self, at: int | None = None) -> Mapping[WriterName, Camera]:
+        """The newest calibration of each camera: those before it are not kept."""
+        with self._lock:
+            return dict(self._cameras.values())
+
+    def _on_pictures(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            if self._selected and robot not in self._selected:
+                continue
+            assert isinstance(message, CompressedImage)
+            sensor = self._sensor_of(key, self._pictures, self._writer(robot, key))
+            if sensor is not None:
+                sensor.keep(packet_from_message(message, robot))
+
+    def _on_cameras(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            if self._selected and robot not in self._selected:
+                continue
+            assert isinstance(message, CameraInfo)
+            try:
+                camera = camera_from_message(message, robot) if message.is_calibrated else None
+            except InvalidInput as error:
+                self._refusals.count("malformed calibration", f"{shortened(key)}: {error}")
+                continue
+            with self._lock:
+                if camera is None:
+                    self._cameras.pop(key, None)
+                elif key in self._cameras or len(self._cameras) < _MAX_WRITERS:
+                    self._cameras[key] = self._writer(robot, key), camera
+
+    def _on_camera_withdrawn(self, key: str) -> None:
+        with self._lock:
+            self._cameras.pop(key, None)
+
+    def _sensor_of(self, key: str, sensors: _SensorTable[M], name: WriterName) -> LiveSensor[M] | None:
+        """The sensor of this name, which replaces the longest stale one; None if there is no room."""
+        with self._lock:
+            if name in sensors:
+                return sensors[name]
+            stale = [(one.received_s, other) for other, one in sensors.items() if one.is_stale()]
+            if len(sensors) < _MAX_WRITERS or stale:
+                if len(sensors) >= _MAX_WRITERS:
+                    del sensors[min(stale)[1]]
+                return sensors.setdefault(name, LiveSensor(self._clock, sensors.max_bytes))
         text = (
             f"{shortened(key)} is not drawn, as {_MAX_WRITERS} other sensors are; "
             "`zstate view ROBOT` draws those of one robot"
         )
-        is_scan = isinstance(measured, Scan)
-        self._refusals.count(_TOO_MANY_SENSORS if is_scan else _TOO_MANY_CLOUDS, text)
-
-    def _sensor_of(self, sensors: dict[WriterName, LiveSensor[M]], name: WriterName) -> LiveSensor[M] | None:
-        """The sensor of this name, which replaces the longest stale one; None if there is no room."""
-        with self._lock:
-            if name not in sensors and len(sensors) >= _MAX_WRITERS:
-                stale = [(one.received_s, other) for other, one in sensors.items() if one.is_stale()]
-                if not stale:
-                    return None
-                del sensors[min(stale)[1]]
-            if name not in sensors:
-                is_scan = sensors is self._sensors
-                sensors[name] = LiveSensor(self._clock, _SCAN_BYTES if is_scan else _CLOUD_BYTES)
-            return sensors[name]
+        self._refusals.count(sensors.too_many, text)
+        return None
 
     def _on_maps(self, received: list[Received]) -> None:
         for robot, key, message in received:

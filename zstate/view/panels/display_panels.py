@@ -151,7 +151,8 @@ class RobotsPanel:
         poses = [track for track in silent if isinstance(track, PoseTrack)]
         edges = [f"{track.name}: {silent[track]}" for track in poses]
         meshes = [f"{uri}\n    {why}" for robot in robots for uri, why in self._scene.missing_meshes(robot)]
-        missing = (*self._scene.world.missing, *self._scene.clouds.missing)
+        scene = self._scene
+        missing = *scene.world.missing, *scene.clouds.missing, *scene.cameras.missing
         around = [f"{name}: {why}" for name, why in missing]
         self._missing.content = (
             disconnected_html(tree, context.fixed)

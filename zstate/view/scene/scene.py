@@ -18,6 +18,7 @@ from zstate.model.findings import Finding
 from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
 from zstate.view.meshes import Meshes, MeshLoader
+from zstate.view.scene.cameras import Cameras
 from zstate.view.scene.clouds import Clouds
 from zstate.view.scene.frames import (
     Axes,
@@ -46,8 +47,9 @@ class Scene:
 
     Attributes, used by the next ``show``: ``visuals`` and ``collisions`` of robots (the latter translucent),
     and ``axes``, ``names`` and ``parent_lines`` of frames. ``layout`` places unconnected trees; ``world``
-    draws scans and maps, ``clouds`` those of lidars, ``odometry`` the paths of bases. Meshes and maps are
-    loaded in the background; the scene is ``busy`` until all are drawn. To be used by one thread.
+    draws scans and maps, ``clouds`` those of lidars, ``cameras`` pictures on frustums, ``odometry`` the paths
+    of bases. Meshes and maps are loaded in the background; the scene is ``busy`` until all are drawn. To be
+    used by one thread.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -75,6 +77,7 @@ class Scene:
         self._trails = Trails(scene)
         self.world = World(scene)
         self.clouds = Clouds(scene)
+        self.cameras = Cameras(scene)
         self.odometry = OdometryPaths(scene)
         self.layout = TreeLayout()
         self._stale_labels = NodeLabels(scene, "stale", anchor="top-center")
