@@ -333,17 +333,17 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
 
 
 def test_picture_is_shown_in_the_tab_and_on_the_frustum(open_tab, show_view, sessions):
-    # A red picture, seen from behind the arm by a camera that looks along y of the world.
+    # A red picture of a camera beside the arm, which looks at it along -y of the world.
     red = np.tile(np.array([200, 20, 20], np.uint8), (48, 64, 1))
     camera = Camera(64, 48, (60.0, 60.0, 31.5, 23.5), frame="lens")
-    turn = (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+    turn = (0.0, math.sqrt(0.5), -math.sqrt(0.5), 0.0)
     with (
         standing(sessions[0], "rrbot"),
         StaticPublisher(sessions[0], "rrbot", "mount") as mount,
         CameraPublisher(sessions[0], "rrbot", "wrist", camera) as publisher,
         repeated(lambda: publisher.publish(red), every_s=0.1),
     ):
-        mount.set(Transform("world", "lens", (0.5, 0.0, 1.0), turn))
+        mount.set(Transform("world", "lens", (0.0, 3.0, 1.0), turn))
         shown = show_view(sessions[1], "rrbot")
         until(lambda: "rrbot" in shown.source.models and shown.view.scene.cameras.shown)
         view_tab = open_tab(shown.page.url)
@@ -360,6 +360,18 @@ def test_picture_is_shown_in_the_tab_and_on_the_frustum(open_tab, show_view, ses
         until(lambda: all(red_parts()), PATIENCE_S)
         view_tab.text("64 x 48 jpeg")
         view_tab.save_screenshot("picture")
+
+        # The outline of the arm, which the camera sees, is green.
+        def has_green() -> bool:
+            red, green, blue = np.moveaxis(view_tab.pixels().astype(int)[150:, width:], -1, 0)
+            return (green - np.maximum(red, blue) > 40).sum() > 30
+
+        assert not has_green()
+        field(view_tab, "Model over picture").click()
+        until(lambda: shown.view.scene.cameras.models)
+        until(has_green, PATIENCE_S)
+        view_tab.save_screenshot("picture_model")
+        field(view_tab, "Model over picture").click()
         field(view_tab, "Frustums").click()
         until(lambda: not shown.view.scene.cameras.frustums)
         until(lambda: red_parts() == (False, True), PATIENCE_S)

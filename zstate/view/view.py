@@ -160,7 +160,7 @@ class View(Closeable):
         fixed = self.layout.fixed.resolve(snapshot.tree) or own
         with self._page.server.atomic():
             try:
-                self.scene.cameras.read(self._source.world, at)
+                self.scene.cameras.read(self._source.world, self._source.buffer, self.scene.kinds, at)
                 if fixed:
                     poses = self.scene.show(snapshot, fixed) if snapshot.tree.names else _NO_POSES
                     place = DrawnFrames(snapshot.tree, poses, fixed)

@@ -12,6 +12,7 @@ viser = pytest.importorskip("viser")
 from helpers.pictures import jpeg, video  # noqa: E402
 from helpers.scene_drawing import at, handles, is_visible, pose_in_fixed, sent_messages, tree  # noqa: E402
 
+from zstate.buffer.buffer import TransformBuffer  # noqa: E402
 from zstate.cameras import Camera  # noqa: E402
 from zstate.view.pictures import Packet  # noqa: E402
 from zstate.view.scene.cameras import Cameras, field_of_view  # noqa: E402
@@ -45,6 +46,7 @@ class Shown:
         self.source = WorldSource(None)
         self.source._cameras[KEY] = WRIST, CAMERA
         self.sensor = self.source._pictures[WRIST] = LiveSensor(self.clock)
+        self.buffer = TransformBuffer()
         self.count = 0
 
     def add(self, data: bytes, form="jpeg", frame: str = "r1/lens") -> None:
@@ -53,7 +55,7 @@ class Shown:
 
     def show(self, stamp: int | None = None, place: DrawnFrames = PLACE) -> None:
         self.clock.now_s += 0.11
-        self.cameras.read(self.source, stamp)
+        self.cameras.read(self.source, self.buffer, {}, stamp)
         self.cameras.show(place)
 
     def frustum(self):

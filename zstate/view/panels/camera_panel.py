@@ -23,7 +23,7 @@ class CamerasPanel:
         self._tabs = tabs
         self._cameras = cameras
         self._tab: viser.GuiTabHandle | None = None
-        self._frustums: viser.GuiCheckboxHandle | None = None
+        self._boxes: tuple[viser.GuiCheckboxHandle, viser.GuiCheckboxHandle] | None = None
         self._panels: dict[WriterName, _CameraPanel] = {}
 
     def update(self, context: PanelContext) -> None:
@@ -34,10 +34,13 @@ class CamerasPanel:
             self._tab = self._tabs.add_tab("Cameras")
             with self._tab:
                 hint = "Draw each picture on the frustum of its camera, too."
-                self._frustums = self._gui.add_checkbox("Frustums", self._cameras.frustums, hint=hint)
-        if self._tab is None or self._frustums is None:
+                frustums = self._gui.add_checkbox("Frustums", self._cameras.frustums, hint=hint)
+                hint = "Lines of the robots where they were at the stamp of the picture, by the calibration."
+                models = self._gui.add_checkbox("Model over picture", self._cameras.models, hint=hint)
+                self._boxes = frustums, models
+        if self._tab is None or self._boxes is None:
             return
-        self._cameras.frustums = self._frustums.value
+        self._cameras.frustums, self._cameras.models = (box.value for box in self._boxes)
         for name, picture in shown.items():
             if name not in self._panels:
                 with self._tab:
@@ -81,4 +84,6 @@ def picture_text(shown: ShownPicture, context: PanelContext) -> str:
         parts.append(f"{age} old" if context.is_live else f"{age} before the instant on display")
     if shown.is_old:
         parts.append(shown.problem or "no newer one arrives")
+    if shown.model_problem is not None:
+        parts.append(f"without the model: {shown.model_problem}")
     return ", ".join(parts)

@@ -12,8 +12,11 @@ import numpy as np
 import viser
 
 from zstate import se3
+from zstate.buffer.buffer import TransformBuffer
 from zstate.cameras.camera import Camera
 from zstate.view.pictures import Packet, PictureReader, StillPicture
+from zstate.view.scene.model_overlay import ModelOverlay
+from zstate.view.scene.robot_meshes import RobotKind
 from zstate.view.scene.world import STALE_COLOR, DrawnFrames, move_node
 from zstate.view.world_source import Sensor, WorldData, WriterName
 
@@ -31,24 +34,28 @@ class ShownPicture(NamedTuple):
     """The picture of one camera on display; ``camera`` is None if its calibration is not known.
 
     It is old if its camera has missed its deadline, or if newer packets could not be decoded: ``problem``.
+    ``model_problem`` is why the models of robots are not drawn over it, None if they are, or are not wanted.
     """
 
     picture: StillPicture
     camera: Camera | None
     is_old: bool
     problem: str | None
+    model_problem: str | None = None
 
 
 class Cameras:
     """Reads the newest picture of each camera, and draws it on a frustum if its pose is known.
 
-    ``shown`` are the newest pictures of all cameras; ``show`` uses ``frustums``, which the page changes.
+    ``shown`` are the newest pictures of all cameras. The page changes ``frustums``, and ``models``: whether
+    the models of robots are drawn over the pictures; then they are the newest for which there are poses.
     ``missing`` is what is not drawn, with the reason. ``clock`` is a monotonic clock [s]. To be used by one
     thread.
     """
 
     def __init__(self, scene: viser.SceneApi, clock: Callable[[], float] = time.monotonic) -> None:
         self.frustums = True
+        self.models = False
         self.shown: Mapping[WriterName, ShownPicture] = {}
         self.missing: Sequence[tuple[str, str]] = ()
         self._scene = scene
@@ -56,6 +63,7 @@ class Cameras:
         self._due_s = -math.inf
         self._cameras: dict[WriterName, _CameraNode] = {}
         self._count = 0
+        self._overlay = ModelOverlay()
 
     def show(self, place: DrawnFrames) -> None:
         """Draw the pictures that were read."""
@@ -65,6 +73,8 @@ class Cameras:
             pose = place.pose(frame)
             if shown.problem is not None:
                 missing.append((f"pictures of {name}", shown.problem))
+            if shown.model_problem is not None:
+                missing.append((f"model over pictures of {name}", shown.model_problem))
             if shown.camera is None:
                 missing.append((f"frustum of {name}", "its calibration, or one of this size, is not known"))
             elif pose is None:
@@ -72,11 +82,17 @@ class Cameras:
             self._cameras[name].show(self._scene, shown, pose if self.frustums else None)
         self.missing = missing
 
-    def read(self, source: WorldData, at: int | None) -> None:
-        """Read the pictures ``at`` a stamp [ns], ten times a second; None: the newest."""
+    def read(
+        self, source: WorldData, buffer: TransformBuffer, kinds: Mapping[str, RobotKind], at: int | None
+    ) -> None:
+        """Read the pictures ``at`` a stamp [ns], ten times a second; None: the newest.
+
+        ``kinds`` are the robots whose models may be drawn over them.
+        """
         if self._clock() < self._due_s:
             return
         self._due_s = self._clock() + _PERIOD_S
+        self._overlay.load(kinds if self.models else {})
         sensors, cameras = source.pictures, source.cameras_at(at)
         for name in self._cameras.keys() - sensors.keys():
             self._cameras.pop(name).remove()
@@ -85,15 +101,27 @@ class Cameras:
             if name not in self._cameras:
                 self._cameras[name] = _CameraNode(f"/cameras/{self._count}")
                 self._count += 1
-            reader = self._cameras[name].reader
-            picture = reader.read(last_packets(sensor, at))
-            if picture is not None:
-                camera = cameras.get(name)
-                if camera is not None and picture.size != (camera.width, camera.height):
-                    camera = None
-                is_old = sensor.is_stale(at) or reader.problem is not None
-                shown[name] = ShownPicture(picture, camera, is_old, reader.problem)
+            node = self._cameras[name]
+            packets = last_packets(sensor, self._until(sensor, buffer, at))
+            picture, problem = node.reader.read(packets), node.reader.problem
+            if picture is None:
+                continue
+            camera = cameras.get(name)
+            if camera is not None and picture.size != (camera.width, camera.height):
+                camera = None
+            is_old, model_problem = sensor.is_stale(at) or problem is not None, None
+            if self.models and camera is not None:
+                picture, model_problem = node.with_models(picture, camera, self._overlay, buffer)
+            shown[name] = ShownPicture(picture, camera, is_old, problem, model_problem)
         self.shown = shown
+
+    def _until(self, sensor: Sensor[Packet], buffer: TransformBuffer, at: int | None) -> int | None:
+        """``at``, or the newest stamp [ns] with poses, where models are drawn over the pictures."""
+        newest = sensor.latest(1, at)
+        if not self.models or not newest:
+            return at
+        known = self._overlay.newest(newest[0].frame, buffer)
+        return at if known is None else known if at is None else min(at, known)
 
 
 def last_packets(sensor: Sensor[Packet], at: int | None) -> Sequence[Packet]:
@@ -110,6 +138,18 @@ class _CameraNode:
     reader: PictureReader = field(default_factory=PictureReader)
     _frustum: viser.CameraFrustumHandle | None = None
     _drawn: tuple[StillPicture, Camera] | None = None
+    _overlaid: tuple[StillPicture, StillPicture] | None = None
+    """The last picture without and with models."""
+
+    def with_models(
+        self, picture: StillPicture, camera: Camera, overlay: ModelOverlay, buffer: TransformBuffer
+    ) -> tuple[StillPicture, str | None]:
+        """``picture`` with models, drawn once if all of them have poses; and why they have not."""
+        if self._overlaid is not None and self._overlaid[0] is picture:
+            return self._overlaid[1], None
+        drawn, problem = overlay.drawn_over(picture, camera, buffer)
+        self._overlaid = (picture, drawn) if problem is None else None
+        return drawn, problem
 
     def show(self, scene: viser.SceneApi, shown: ShownPicture, pose: se3.Pose | None) -> None:
         """Draw it at ``pose``, or hide it without one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -145,6 +145,11 @@ class Scene:
     def set_trail(self, frame: str, on: bool) -> None:
         """Start or remove the trail of a frame."""
         self._trails.set_trail(frame, on)
+
+    @property
+    def kinds(self) -> Mapping[str, RobotKind]:
+        """The shapes of each robot with a model."""
+        return {robot: meshes.kind for meshes in self._meshes() for robot in meshes.robots}
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
         """Files of a robot that cannot be drawn: the name in the URDF, and the reason."""
