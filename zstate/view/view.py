@@ -171,7 +171,7 @@ class View(Closeable):
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
                         self._held_poses = poses
-                        if not self.scene.busy:
+                        if not self.scene.busy and not self.scene.clouds.busy:
                             self._hold_complete.set()
             finally:
                 # Panels mark robots that have become stale since: wrong in a picture of an earlier instant.

@@ -50,7 +50,7 @@ class FixedClouds(WorldSource):
         self.limits: dict[WriterName, int] = {}
 
     def add(self, cloud: Cloud, name: WriterName = TOP, most: int = 200_000) -> None:
-        self._clouds.setdefault(name, LiveSensor()).add(thinned_cloud(cloud, most))
+        self._clouds.setdefault(name, LiveSensor(max_bytes=10**9)).add(thinned_cloud(cloud, most))
 
     def limit_clouds(self, name: WriterName, points: int) -> None:
         self.limits[name] = points
@@ -145,6 +145,21 @@ def test_points_of_all_sensors_and_clouds_are_at_most_those_asked_for(shown):
         drawn.append(shown.count())
     assert max(drawn) <= 1000
     assert min(drawn[11:]) > 500  # once the window is full
+
+
+def test_many_points_are_drawn_over_several_pictures_the_newest_first(shown):
+    shown.clouds.points, shown.clouds.window_s = 2_000_000, 1.0
+    for stamp in range(0, 500, 100):
+        shown.source.add(cloud_at(stamp * MS, np.ones((150_000, 3))))
+    shown.show()
+    assert shown.clouds.busy
+    newest = [node.points[0, 0] for node in shown.nodes()]
+    assert newest == pytest.approx([301, 401])
+    while shown.clouds.busy:
+        before = shown.count()
+        shown.show()
+        assert 0 < shown.count() - before <= 2 * 150_000
+    assert len(shown.nodes()) == 5
 
 
 def test_more_points_are_drawn_when_they_are_asked_for(shown):

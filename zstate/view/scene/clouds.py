@@ -32,6 +32,9 @@ _WIDER = 0.1
 _SPARE = 1.25
 """For so many times the clouds of the window there are points, so that the next few do not thin out all."""
 
+_AT_ONCE = 200_000
+"""The points of a sensor that are drawn in one picture of the page, the newest first; it takes 20 ms."""
+
 Floats = NDArray[np.float32]
 Colors = NDArray[np.uint8]
 
@@ -81,6 +84,11 @@ class Clouds:
         """Whether there is a sensor with clouds."""
         return bool(self._drawn)
 
+    @property
+    def busy(self) -> bool:
+        """Whether some clouds are still to be drawn."""
+        return any(clouds.busy for clouds in self._drawn.values())
+
     def show(self, source: WorldData, buffer: TransformBuffer, place: DrawnFrames, at: int | None) -> None:
         """Draw the last clouds ``at`` a stamp [ns]; None: the newest."""
         sensors = source.clouds
@@ -107,11 +115,13 @@ class SensorClouds:
     """The last clouds of one sensor, a node for each; those of a stale sensor are grey.
 
     Each point is placed by the pose at its own stamp, once: a node does not move afterwards, unless its tree
-    is not connected to the fixed frame. ``share`` is how many points of each cloud are drawn.
+    is not connected to the fixed frame. ``share`` is how many points of each cloud are drawn. While many are
+    drawn again the sensor is ``busy``.
     """
 
     def __init__(self, nodes: PointNodes, buffer: TransformBuffer, color: Colors) -> None:
         self.share = CLOUD_POINTS
+        self.busy = False
         self._nodes = nodes
         self._buffer = buffer
         self._color = color
@@ -171,9 +181,12 @@ class SensorClouds:
         for cloud, drawn in list(self._drawn.items()):
             if is_moved or cloud not in kept or drawn.points != min(len(cloud), self.share):
                 self._nodes.hide(self._drawn.pop(cloud).node)
-        for cloud in clouds:
-            if cloud not in self._drawn:
+        left = _AT_ONCE
+        for cloud in reversed(clouds):
+            if cloud not in self._drawn and left > 0:
                 self._drawn[cloud] = self._placed(cloud.thinned(self.share))
+                left -= self._drawn[cloud].points
+        self.busy = len(self._drawn) < len(clouds)
 
     def _placed(self, cloud: ThinnedCloud) -> _DrawnCloud:
         """A new node; without the points that have no pose, which are before the buffer's history."""
