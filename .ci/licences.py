@@ -16,8 +16,12 @@ from packaging.utils import canonicalize_name
 
 PAGE = Path(__file__).parents[1] / "docs" / "licences.md"
 EXTRAS = ("all", "mujoco")
-STATED = {"cmeel-qhull": "Qhull", "xacro": "BSD-3-Clause"}
-"""Of packages whose metadata has no name of a licence: what the text in them is."""
+STATED = {
+    "av": "BSD-3-Clause; its wheel has FFmpeg (LGPL-3.0-or-later), x264 and x265 (GPL-2.0-or-later)",
+    "cmeel-qhull": "Qhull",
+    "xacro": "BSD-3-Clause",
+}
+"""Where the metadata of a package has no name of a licence, or not those of all that is in its wheel."""
 
 _HEAD = """# Licences of dependencies
 

@@ -32,7 +32,7 @@ JOIN_WITHIN_S = 20.0
 POLL_S = 0.0005
 # A late writer catches up at most this much; then its schedule restarts.
 MAX_BEHIND_NS = 50_000_000
-# Of a soak: the half minute of a latched value, how often a reader looks, and the ages that it counts.
+# A soak: the half minute of a latched value, how often a reader looks, and the ages that it counts.
 LATCH_S, LOOK_S = 30, 0.5
 AGE_BINS, STALE_NS = 100_000, 10**9
 

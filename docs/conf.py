@@ -86,13 +86,15 @@ PAGES = {
 
 # Types of other projects: their inventories are on other hosts, and the build makes no requests.
 _NUMPY = "https://numpy.org/doc/stable/reference"
-_ELSEWHERE = {
-    r"numpy\.(ndarray|dtype)": _NUMPY + r"/generated/numpy.\1.html",
-    r"numpy\.(\w+)": _NUMPY + r"/arrays.scalars.html#numpy.\1",
-    r"(ArrayLike|NDArray)": _NUMPY + r"/typing.html#numpy.typing.\1",
-    r"zenoh\.(\w+)": r"https://zenoh-python.readthedocs.io/en/latest/api_reference.html#zenoh.\1",
+_ZENOH = "https://zenoh-python.readthedocs.io/en/latest/api_reference.html"
+_SCALARS = ("bool", "float32", "float64", "int8", "int64", "uint8")
+ELSEWHERE = {
+    **{f"numpy.{name}": f"{_NUMPY}/generated/numpy.{name}.html" for name in ("dtype", "ndarray")},
+    **{f"numpy.{name}": f"{_NUMPY}/arrays.scalars.html#numpy.{name}" for name in _SCALARS},
+    **{name: f"{_NUMPY}/typing.html#numpy.typing.{name}" for name in ("ArrayLike", "NDArray")},
+    "zenoh.Session": f"{_ZENOH}#zenoh.Session",
 }
-"""By pattern of a name, the address of its description."""
+"""By name, the address of its description. A name that is not here fails the build."""
 
 
 def _target(file: Path, link: str) -> Path | None:
@@ -139,10 +141,8 @@ def _read_included(app: Sphinx, included: Path, parent: str, content: list[str])
 def _link_elsewhere(*event: Any) -> nodes.reference | None:
     """A type of another project as a link; None for other names."""
     _, _, node, content = event
-    for pattern, address in _ELSEWHERE.items():
-        if found := re.fullmatch(pattern, node["reftarget"]):
-            return nodes.reference("", "", content, internal=False, refuri=found.expand(address))
-    return None
+    address = ELSEWHERE.get(node["reftarget"])
+    return None if address is None else nodes.reference("", "", content, internal=False, refuri=address)
 
 
 def _shorten_signature(*event: Any) -> tuple[str, str] | None:

@@ -16,6 +16,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 import zstate
+from zstate.cameras import Camera
 
 FOLDER = Path(__file__).with_name("figures")
 Point = tuple[float, float]
@@ -379,6 +380,79 @@ def scan() -> Figure:
     return figure
 
 
+def lidar() -> Figure:
+    """A sweep of a lidar that drives, placed with one pose and with a pose for each point."""
+    figure = Figure(720, 290, "A room, measured by a lidar that drives forward and turns")
+    duration, speed, rate = 0.1, 5.0, 1.5  # [s], [m/s], [rad/s]
+    half = np.array([3.0, 2.0])  # of the room [m]
+    stamps = np.linspace(1, round(1e9 * duration) + 1, 57).astype(np.int64)
+    since = (stamps - 1) * 1e-9
+    buffer = zstate.TransformBuffer()
+    for stamp, s in zip(stamps.tolist(), since.tolist(), strict=True):
+        pose = zstate.Transform.from_rpy(
+            "room", "lidar", [speed * s - 0.25, 0, 0], [0, 0, rate * s], stamp=stamp
+        )
+        buffer.insert(pose)
+    bearings = 2.0 * np.pi * since / duration
+    directions = np.stack([np.cos(bearings + rate * since), np.sin(bearings + rate * since)], axis=1)
+    starts = np.stack([speed * since - 0.25, 0.0 * since], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a wall
+        ranges = np.nanmin((np.sign(directions) * half - starts) / directions, axis=1)
+    points = ranges[:, None] * np.stack([np.cos(bearings), np.sin(bearings), 0.0 * bearings], axis=1)
+    last = np.full_like(stamps, stamps[-1])
+    for x, times, title in (
+        (190, last, "one pose for the whole sweep"),
+        (530, stamps, "each point at its own instant"),
+    ):
+        placed, valid = buffer.place(points, times, source="lidar", target="room")
+        assert valid.all()
+        corners = [(x + sx * 48 * half[0], 148 + sy * 48 * half[1]) for sx, sy in _AROUND]
+        figure.path([*corners, corners[0]], "m")
+        figure.dots([(x + 48 * p[0], 148 - 48 * p[1]) for p in placed], "dr" if times is last else "dc", 3)
+        figure.arrow((x - 12, 148), (x + 12, 148))
+        figure.text(x, 26, title, "bold")
+    figure.caption(
+        278, "A turn takes 0.1 s: the robot drives 0.5 m and turns by 9 degrees. The grey line is the wall."
+    )
+    return figure
+
+
+_AROUND = (-1, -1), (1, -1), (1, 1), (-1, 1)
+
+
+def camera() -> Figure:
+    """Points on a floor in a picture: where they are, and where a wrong mount projects them."""
+    figure = Figure(720, 300, "Points in a picture, and where a wrong mount projects them")
+    lens = Camera(640, 480, (600.0, 600.0, 319.5, 239.5))
+    optical = zstate.Transform.from_rpy("eye", "lens", [0, 0, 0], [-math.pi / 2, 0, -math.pi / 2])
+    points = np.array([(x, y, 0.0) for x in (1.6, 2.4, 4.0, 7.0) for y in (-0.5, 0.0, 0.5)])
+    mounts = {
+        "meant": ([0.0, 0.0, 0.8], 0.0),
+        "turned by 3 degrees": ([0.0, 0.0, 0.8], math.radians(3.0)),
+        "moved by 10 cm": ([0.0, 0.1, 0.8], 0.0),
+    }
+    pixels = {
+        name: lens.project(
+            (zstate.Transform.from_rpy("floor", "eye", at, [0, 0.25, yaw]) @ optical).inverse() @ points
+        )[0]
+        for name, (at, yaw) in mounts.items()
+    }
+    for x, name in ((30, "turned by 3 degrees"), (370, "moved by 10 cm")):
+        drawn = {
+            kind: [(x + u / 2, 40 + v / 2) for u, v in pixels[kind].tolist()] for kind in ("meant", name)
+        }
+        figure.box(x, 40, (320, 222), "", "fm")
+        for meant, seen in zip(drawn["meant"], drawn[name], strict=True):
+            figure.path((meant, seen), "m thin")
+        figure.dots(drawn["meant"], "dr", 3.5)
+        figure.dots(drawn[name], "dc", 3.5)
+        figure.text(x + 160, 28, name, "bold")
+    figure.caption(
+        284, "Green: where points of the floor are seen. Red: where the assumed mount projects them."
+    )
+    return figure
+
+
 def panels() -> Figure:
     """The parts of the page of zstate view."""
     figure = Figure(720, 330, "The page of zstate view")
@@ -569,7 +643,8 @@ def foxglove() -> Figure:
 
 
 FIGURES: Sequence[Callable[[], Figure]] = (
-    *(arrays, chain, dataset, drivers, driving, ellipse, foxglove, network, odometry_sources, panels),
+    *(arrays, camera, chain, dataset, drivers, driving, ellipse, foxglove, lidar, network),
+    *(odometry_sources, panels),
     *(
         pose_in_odom,
         recordings,

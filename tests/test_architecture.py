@@ -102,6 +102,7 @@ GUESTS = {
     ("driving/cli/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
     ("clouds/compression.py", "lz4"),
     ("clouds/compression.py", "zstandard"),
+    ("cameras/simulated_camera.py", "PIL"),
     ("scans/map_files.py", "PIL"),
     ("transform.py", "pinocchio"),  # `Transform.se3`, when it is read
     ("view/browser_messages.py", "msgspec"),  # what viser's page sends
@@ -110,6 +111,7 @@ GUESTS = {
     # each reads one kind of file in YAML
     ("cli/up/static_edges.py", "yaml"),
     ("scans/map_metadata.py", "yaml"),
+    ("cameras/calibration_file.py", "yaml"),
 }
 
 # Not in what the two nodes load when they are imported: a reader of "joint positions in, poses out" passes

@@ -17,7 +17,7 @@ import pytest
 from helpers.recording_builder import START, RecordingBuilder
 
 from zstate import JointReading, Kinematics, Recording, Transform, TransformBuffer, Twist
-from zstate.cameras import Camera, Picture
+from zstate.cameras import Camera, Picture, RosImage, StampedPicture, Surface
 from zstate.clouds import Cloud, PlacedCloud
 from zstate.driving import DriverReport, Limits, Outcome, Setpoint
 from zstate.driving.driver_state import Spread
@@ -108,6 +108,9 @@ def examples() -> list[Any]:
         PlacedCloud(cloud, "front", "odom", cloud.xyz.copy(), cloud.valid),
         Camera(64, 48, (60.0, 60.0, 31.5, 23.5)),
         Picture("front", 5, "arm/lens", "jpeg", b"\xff", (64, 48), None),
+        RosImage(5, "lens", np.zeros((2, 3), np.uint8)),
+        StampedPicture(5, b"\xff"),
+        Surface(np.zeros((1, 4, 3), np.float32), np.zeros((1, 3), np.uint8)),
         DriverReport(None, spread, spread, spread, 1, 0, {}),
         Limits.of(RRBOT, velocity=1.0, acceleration=2.0),
         Outcome("reached"),

@@ -70,11 +70,16 @@ class Stream:
       Without ``latched`` they are refused above 1 MB in any case, with ``bulk`` above 64 MB.
     - ``bulk``: its samples are large, as clouds and images are, and give way to those of all other streams:
       Zenoh sends them with a lower priority, and no more than 8 wait for a reader.
+    - ``private``: it shows people and places, as pictures do; access control has a role that does not read
+      it.
     - ``version``: of its messages, in their Zenoh encoding. Fields may be appended within a version.
     - ``start``: how to start a writer, for the tools that miss one; ``{robot}`` in it is the robot's name.
     - ``document``: ``"module:function"`` that makes a dict of a message and the name of its robot, as `zstate
       echo` prints it; by default of all fields, a ``frame`` with its full name.
     - ``full_document``: the same for its options --json, --csv and --field, if that has more.
+    - ``columns``: ``"module:function"`` that makes columns of numbers of a message and the name of its robot,
+      by name and of one length, the first of them ``stamp`` [ns]: `zstate export` writes several rows for
+      each message, as a cloud has several points. By default a message is one row, with its fields.
     - ``recorded``: ``"module:name"`` of how recordings have it where ROS 2 does not carry it
       (zstate.wire.ros2.streams.RecordedForm).
     - ``ros``: ``"module:name"`` of how ROS 2 carries it (zstate.wire.ros2.streams.RosStream); empty if it
@@ -91,11 +96,13 @@ class Stream:
     named: bool = False
     latched: bool = False
     bulk: bool = False
+    private: bool = False
     max_bytes: int = MEASUREMENT_BYTES
     version: int = 1
     start: str = ""
     document: str = ""
     full_document: str = ""
+    columns: str = ""
     recorded: str = ""
     ros: str = ""
 

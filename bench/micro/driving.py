@@ -50,7 +50,7 @@ class TimedDriver(SimulatedDriver):
         super().__init__(model, "dynamics", start=0.5 * (limits.lower + limits.upper))
         self.writes: list[int] = []
         self.velocities: list[float] = []
-        """Of the first joint at each write."""
+        """The velocity of the first joint at each write."""
         self.stops: list[int] = []
         self.own_us: list[float] = []
         """CPU time of each tick from ``read`` to ``write``."""

@@ -83,7 +83,7 @@ def measure(seconds: float = 10.0) -> Iterator[Row]:
                 scans.dropped.clear()  # while the listener had no transforms yet
                 continue
             end, newest = one.scan.end_stamp, scans.buffer.latest("odom", "laser")
-            # Of several samples since the last ray, the scan needs the first.
+            # The scan needs the first of several samples since the last ray.
             placed.append((one.stamp, end, newest - (newest - end) // POSE_NS * POSE_NS, now))
             if now > start + seconds * 1e9:
                 break

@@ -33,7 +33,7 @@ TORQUE, WATCHDOG, GOAL, VELOCITY, POSITION, TABLE_SIZE = 64, 98, 116, 128, 132, 
 
 ACCESS_ERROR = 0x07
 EXPIRED = 0xFF
-"""Of the watchdog: goals are refused until 0 is written to it."""
+"""The state of the watchdog after its time: goals are refused until 0 is written to it."""
 
 WATCHDOG_STEP_S = 0.02
 VELOCITY_STEP = 0.229 / 60.0 * 4096.0  # counts per second

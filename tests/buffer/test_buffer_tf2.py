@@ -31,7 +31,7 @@ from zstate.transform import Transform
 
 pytestmark = pytest.mark.tf2
 
-SCENARIOS, QUESTIONS = 700, 48
+QUESTIONS = 48
 TOLERANCE = 1e-9
 
 ZERO = "stamp 0 is an ordinary instant to us; tf2 takes it for 'the newest'"
@@ -80,9 +80,10 @@ def assert_same_answer(question: list[Any], ours: Transform, theirs: dict[str, A
         assert ours.stamp == theirs["stamp"], question
 
 
-def test_random_lookups_agree_with_tf2_except_for_the_listed_differences() -> None:
+@pytest.mark.parametrize("count", [200, pytest.param(700, marks=pytest.mark.soak)])
+def test_random_lookups_agree_with_tf2_except_for_the_listed_differences(count: int) -> None:
     rng = random.Random(20)
-    scenarios = [a_scenario(rng, QUESTIONS) for _ in range(SCENARIOS)]
+    scenarios = [a_scenario(rng, QUESTIONS) for _ in range(count)]
     agreed: Counter[str] = Counter()
     differed: Counter[str] = Counter()
     for scenario, their_answers in zip(scenarios, tf2_answers(scenarios), strict=True):
@@ -98,8 +99,8 @@ def test_random_lookups_agree_with_tf2_except_for_the_listed_differences() -> No
             if isinstance(ours, Transform):
                 assert_same_answer(question, ours, theirs)
     print(f"agreed: {dict(agreed)}; differed: {dict(differed)}")
-    assert agreed.total() + differed.total() >= 30_000
-    assert agreed["answer"] >= 10_000
+    assert agreed.total() + differed.total() >= 43 * count
+    assert agreed["answer"] >= 15 * count
     assert set(agreed) == {"answer", "time", "disconnected", "unknown", "name"}
     assert set(differed) == {ZERO, *DISAGREEMENTS.values()}, "a row that nothing shows is no row"
 

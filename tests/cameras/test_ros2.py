@@ -12,11 +12,12 @@ from helpers.processes import until
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zstate.cameras import Camera, CameraListener, CameraPublisher
+from zstate.cameras import Camera, CameraListener, CameraPublisher, RosImageListener
 from zstate.cameras.camera import camera_from_message
 from zstate.cameras.messages import CameraInfo, CompressedImage
 from zstate.cameras.ros2 import decode_raw_image
 from zstate.errors import InvalidInput, MessageError
+from zstate.net.streams import KeyPublisher
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import Message, from_block, to_block
 from zstate.wire.ros2.decoder import RosDecoder
@@ -242,12 +243,41 @@ def test_a_raw_picture_is_read_with_its_strides(encoding: str, padding: int):
         (raw("rgb8", pixels(), 192, height=49), "malformed"),
         (raw("rgb8", pixels(), 192, height=2**32 - 1), "too large"),
         (raw("rgb8", pixels(), 192)[:-1], "truncated"),
+        (raw("rgb8", pixels(), 192)[:4] + bytes(8) + raw("rgb8", pixels(), 192)[12:], "no stamp"),
     ],
 )
 def test_a_raw_picture_of_other_strides_sizes_or_encodings_is_refused(payload: bytes, reason: str):
     with pytest.raises(MessageError) as caught:
         decode_raw_image(payload, NAMES)
     assert caught.value.reason == reason
+
+
+def test_raw_pictures_of_a_topic_are_published_as_pictures_of_the_robot(sessions):
+    writer, reader = sessions
+    key = f"0/wrist/image_raw/{IMAGE.dds}/{IMAGE.hash}"
+    with (
+        KeyPublisher(writer, key, "", is_bulk=True) as camera,
+        RosImageListener(reader, "r1", "/wrist/image_raw") as raws,
+        CameraPublisher(reader, "r1", "wrist") as publisher,
+        CameraListener(writer, "r1") as listener,
+    ):
+        camera.put(raw("32FC1", pixels(), 192))
+        until(lambda: camera.put(raw("bgr8", pixels()[..., ::-1], 192)) or len(raws._unread))
+        image = next(iter(raws))
+        assert (image.stamp, image.frame) == (STAMP, "lens")
+        assert np.array_equal(image.pixels, pixels())
+        until(lambda: publisher.publish(image.pixels, image.stamp) or listener.latest)
+        assert listener.latest.stamp == STAMP
+        until(lambda: camera.put(raw("32FC1", pixels(), 192)) or raws.refused)
+        assert set(raws.refused) == {"foreign"}
+
+
+@pytest.mark.parametrize(
+    ("topic", "wire"), [("wrist", "ros2"), ("/wrist-1/image_raw", "ros2"), ("/wrist", "native")]
+)
+def test_what_is_no_topic_or_no_wire_of_raw_pictures_is_refused(sessions, topic: str, wire: str):
+    with pytest.raises(InvalidInput):
+        RosImageListener(sessions[0], "r1", topic, wire=wire)
 
 
 @given(

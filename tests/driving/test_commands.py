@@ -115,9 +115,12 @@ def random_command(
     return {column: JointRate(mode, float(values[mode][column])) for column, mode in picked.items()}
 
 
+@pytest.mark.parametrize("count", [800, pytest.param(2_500, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("modes", [MODES, MODES[:2], MODES[1:], MODES[1:2]], ids="-".join)
 @pytest.mark.long
-def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(modes: tuple[Mode, ...]):
+def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(
+    modes: tuple[Mode, ...], count: int
+):
     generator = np.random.default_rng(19)
     limits = random_limits(generator)
     robot = Robot(np.zeros(COUNT))
@@ -125,7 +128,7 @@ def test_no_sequence_of_modes_commands_silences_and_stops_exceeds_a_limit(modes:
     worst_step = worst_change = 0.0
     seen: set[tuple[Mode, Mode]] = set()
     braked = 0
-    for _ in range(2_500):  # of four kinds of drivers: 10,000 sequences
+    for _ in range(count):  # of each of four kinds of drivers
         match generator.choice(["command", "command", "command", "silence", "stop", "push"]):
             case "command":
                 core.send(random_command(generator, limits, modes), int(generator.integers(1, 12)) * TICK)

@@ -34,7 +34,7 @@ def started(position: float = 0.0, moving: float = 0.0, **limits: float) -> Setp
     return limiter
 
 
-@pytest.mark.parametrize("events", [2_000, pytest.param(10_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("events", [800, pytest.param(10_000, marks=pytest.mark.soak)])
 @pytest.mark.long
 def test_take_overs_replacements_stops_and_restarts_never_step_above_the_limits(events: int):
     generator = np.random.default_rng(19)

@@ -30,6 +30,7 @@ from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.plugins import own_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.wire import keys
 from zstate.wire.messages import TransformSample, order_digest, to_block
@@ -249,6 +250,40 @@ def test_every_identity_reads_the_states_of_drivers_and_nothing_else_that_they_w
     until(publish_until_received)
     assert states["stranger"].arrivals == []
     assert all(tap.arrivals == [] for tap in taps.values())
+
+
+def test_a_state_viewer_reads_all_streams_of_a_robot_but_private_ones(tmp_path):
+    rows = [row for row in own_streams() if row.group != "time"]
+    assert {row.name for row in rows if row.private} == {"image"}
+    keys_of = {row.name: f"zstate/r1/{row.name}{'/one' if row.named else ''}" for row in rows}
+    fleet = AclRoles(("r1",), ("desk",), state_viewers=("hand",))
+    with a_site(tmp_path, fleet) as site:
+        robot = site.join("r1")
+        readers = {user: site.join(user) for user in ("desk", "hand")}
+        taps = {
+            (user, name): SampleCollector(session, key)
+            for user, session in readers.items()
+            for name, key in keys_of.items()
+        }
+        everything = SampleCollector(site.join("hand"), "zstate/**")
+
+        def publish_until_received() -> bool:
+            for key in keys_of.values():
+                robot.zenoh.put(key, b"x")
+            return all(tap.arrivals for one, tap in taps.items() if one != ("hand", "image"))
+
+        until(publish_until_received)
+        assert taps["hand", "image"].arrivals == everything.arrivals == []
+
+
+def test_a_state_viewer_follows_a_robot_that_it_finds(tmp_path):
+    with (
+        a_site(tmp_path, AclRoles(("r1",), state_viewers=("desk",))) as site,
+        StatePublisher(site.join("r1"), RRBOT, "r1") as publisher,
+        TransformListener(site.join("desk"), "r1") as listener,
+    ):
+        until(lambda: publish_and_check(publisher, listener))
+        assert [one.name for one in discover(site.join("desk"))] == ["r1"]
 
 
 def test_a_robot_may_not_have_the_name_of_the_clock():

@@ -19,6 +19,7 @@ from zstate.errors import AccessDenied, InvalidInput
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.router_config import access_text
 from zstate.net.session import Session
+from zstate.wire.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, LASER_SCAN, RosType
 
 WIRE = "ros2:domain=7,namespace=*"
 FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,), commanders=("teleop",))
@@ -146,6 +147,23 @@ def test_only_operators_call_services_and_only_their_robot_replies(join: Join):
     until(lambda: replies(hand, service))
     assert replies(hand, service) == ["stopped"]
     assert replies(join("desk"), service) == []
+
+
+def test_a_state_viewer_is_given_no_pictures_compressed_or_raw():
+    listed = access_control(AclRoles(state_viewers=("desk",), wires=("ros2:domain=5",)))["rules"]
+    given = [
+        zenoh.KeyExpr(key) for rule in listed for key in rule["key_exprs"] if rule["id"].startswith("state")
+    ]
+
+    def is_given(topic: str, kind: RosType) -> bool:
+        key = zenoh.KeyExpr(f"5/r1/{topic}/{kind.dds}/{kind.hash}")
+        return any(one.includes(key) for one in given)
+
+    assert is_given("joint_states", JOINT_STATE)
+    assert is_given("front", LASER_SCAN)
+    assert is_given("wrist/camera_info", CAMERA_INFO)
+    assert not is_given("wrist/image_raw/compressed", COMPRESSED_IMAGE)
+    assert not is_given("wrist/image_raw", IMAGE)
 
 
 def test_rules_of_several_wires_are_combined():

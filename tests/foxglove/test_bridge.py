@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from zstate.fleet.acl import AclRoles
 from zstate.foxglove.bridge import FoxgloveBridge
 from zstate.foxglove.server import SUBPROTOCOLS, FoxgloveServer
 from zstate.net.presence import discover_readers
-from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -39,19 +37,6 @@ from zstate.transform import Transform
 PERIOD = 10_000_000
 CLIENT = str(Path(__file__).parents[1] / "helpers" / "foxglove_client.js")
 TOPICS = ("/joint_states", "/tf", "/tf_static", "/robot_description")
-
-
-@pytest.fixture
-def serve(sessions: tuple[Session, Session]) -> Iterator[Any]:
-    """``serve(*robots)`` serves robots on a free port; the server."""
-    with ExitStack() as opened:
-
-        def serving(*robots: str, **options: Any) -> FoxgloveServer:
-            server = opened.enter_context(FoxgloveServer(port=0))
-            opened.enter_context(FoxgloveBridge(sessions[1], server, robots, **options))
-            return server
-
-        yield serving
 
 
 def stamp_of(header: Any) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import numpy as np
@@ -26,11 +27,23 @@ def png(width: int = 64, height: int = 48) -> bytes:
     return b"".join(_encoded([pixels(width, height)], "png", {}))
 
 
-def video(count: int, form: str = "h264", *, key_every: int = 30) -> list[bytes]:
-    """The packets of ``count`` pictures of 64 x 48, the i-th with the brightness 20 i, in Annex B."""
+def video(count: int, form: str = "h264", *, key_every: int = 30, step: int = 20) -> list[bytes]:
+    """The packets of ``count`` pictures of 64 x 48, the i-th with the brightness ``step`` i, in Annex B."""
     options = {"tune": "zerolatency", "preset": "ultrafast"}
     options |= {"x265-params": "log-level=none"} if form == "h265" else {}
-    return _encoded([pixels(brightness=20 * number) for number in range(count)], form, options, key_every)
+    return _encoded([pixels(brightness=step * number) for number in range(count)], form, options, key_every)
+
+
+def video_file(path: Path, count: int = 5, codec: str = "mjpeg", rate: int = 50) -> str:
+    """A video of ``count`` pictures of 64 x 48, as ``video`` has them; its name gives its container."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.width, stream.height = 64, 48
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for number in range(count):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels(brightness=20 * number), "rgb24")))
+        container.mux(stream.encode(None))
+    return str(path)
 
 
 def _encoded(

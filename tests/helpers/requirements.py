@@ -91,6 +91,10 @@ REQUIREMENTS = {
         lambda: Path(os.environ.get("ZSTATE_FOXGLOVE_CLIENT", "")).is_dir() and "ZSTATE_NODE" in os.environ,
         "as .ci/run installs Foxglove's client with npm",
     ),
+    "lerobot": Requirement(
+        lambda: Path(os.environ.get("ZSTATE_LEROBOT_PYTHON", "")).is_file(),
+        "as .ci/nightly makes an environment of lerobot, 5 GB",
+    ),
 } | {
     name: Requirement(
         lambda name=name: has_oracle(name),

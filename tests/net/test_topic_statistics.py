@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from helpers.processes import until
 
-from zstate import connect
+from zstate import connect, discover
+from zstate.clouds import CloudPublisher
 from zstate.net.topic_statistics import (
     Arrival,
     IntervalStatistics,
@@ -72,3 +75,15 @@ def test_samples_of_one_message_count_once_per_source():
         statistics = topic.get(WriterKey("r1", "joint_states", 7))
     assert statistics is not None
     assert statistics.count == 2
+
+
+def test_bulk_data_has_the_rate_that_its_writer_states_and_is_not_received(sessions):
+    points = np.zeros((2, 3), np.float32)
+    with CloudPublisher(sessions[0], "r1", "lidar") as lidar:
+        (writer,) = {writer for _, writer in discover(sessions[0])[0].writers}
+        key = WriterKey("r1", "cloud", writer.session)
+        with TopicStatistics(sessions[1], get_wire("native")) as statistics:
+            statistics.watch(("imu", "cloud"))
+            until(lambda: lidar.publish(points) or statistics.published_hz(key))
+            statistics.wait([key], 0.0)
+            assert statistics.get(key) is None

@@ -87,7 +87,7 @@ def health_of(base: BaseEstimator, name: str) -> SourceHealth:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("runs", [10, pytest.param(25, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("runs", [5, pytest.param(25, marks=pytest.mark.soak)])
 def test_errors_are_as_large_as_their_covariances_with_a_source_late_and_shuffled(runs: int):
     """Runs of 5 s in 3D, from rest, with a turned IMU."""
     errors: list[tuple[float, float, float]] = []

@@ -83,7 +83,7 @@ def measured_run(body: SimulatedBody, steps: int) -> FilterState:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("runs", [40, pytest.param(100, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("runs", [15, pytest.param(100, marks=pytest.mark.soak)])
 def test_errors_of_many_runs_are_as_large_as_the_covariance_states(runs: int):
     bodies = [SimulatedBody(seed, dt_s=0.02) for seed in range(runs)]
     nees = np.array([body.nees(measured_run(body, 180)) for body in bodies])

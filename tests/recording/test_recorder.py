@@ -338,7 +338,7 @@ def test_missed_undecodable_and_unwritable_messages_are_counted(sessions, tmp_pa
         until(lambda: count(recorder, "r1") == 4)
         until(lambda: sum(recorder.stats.refused.values()) == 4)
     stats = recorder.stats
-    assert (stats.missed, stats.dropped) == (3, 0)
+    assert (stats.missed, stats.dropped, stats.missing) == (3, 0, {("r1", "joint_states"): 3})
     assert stats.refused == {"no stamp": 1, "stamp outside 1901 to 2038": 1, "malformed": 1, "foreign": 1}
     with RecordingReader(tmp_path / "run.mcap") as recording:
         assert [record.sequence for record in recording.records()] == [7, 8, 12, 15]

@@ -3,12 +3,12 @@ from __future__ import annotations
 import time
 from contextlib import closing
 
-from helpers.processes import until
+from helpers.processes import repeated, until
 from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate.net.latched import LatchedPublisher
-from zstate.net.streams import CAPACITY, KeyPublisher
-from zstate.recording.recorder import QUEUE_LENGTH, Batch, MessageQueue
+from zstate.net.streams import BULK_CAPACITY, CAPACITY, KeyPublisher, StreamSubscriber
+from zstate.recording.recorder import BULK_QUEUE_BYTES, QUEUE_LENGTH, Batch, MessageQueue
 
 
 def payloads(batches: list[Batch]) -> list[bytes]:
@@ -38,6 +38,32 @@ def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
     assert all(before <= one.stamp <= time.time_ns() and not one.overflowed for one in ours)
     assert {one.stream for one in ours} == {"joint_states"}
     assert b"holds" in payloads([one for one in batches if one.stream == "robot_description"])
+
+
+def test_bulk_data_that_waits_leaves_room_for_other_samples_and_its_loss_is_reported(sessions):
+    writer, reader = sessions
+    seen: list[int] = []
+    with (
+        MessageQueue(reader) as inbox,
+        KeyPublisher(writer, "a/cloud", "", is_bulk=True) as clouds,
+        KeyPublisher(writer, "a/samples", "") as samples,
+        StreamSubscriber(reader, "a/cloud", lambda batch: seen.extend(map(id, batch)), is_bulk=True),
+    ):
+        inbox.subscribe("cloud", ["a/cloud"], "r1")
+        inbox.subscribe("joint_states", ["a/samples"], "r1")
+        until(lambda: clouds.has_readers and samples.has_readers)
+        large = bytes(8_000_000)
+        with repeated(lambda: clouds.put(large)):
+            until(lambda: inbox._bytes >= BULK_QUEUE_BYTES)
+            waiting = inbox._bytes
+            samples.put(b"state")
+            until(lambda: inbox._batches[-1].stream == "joint_states")
+            before = len(seen)
+            until(lambda: len(seen) >= before + 3 * BULK_CAPACITY)  # its ring drops the oldest
+        assert waiting < BULK_QUEUE_BYTES + BULK_CAPACITY * len(large)
+        batches: list[Batch] = []
+        until(lambda: batches.extend(inbox.pop_all()) or any(one.overflowed for one in batches))
+    assert b"state" in payloads(batches)
 
 
 def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):

@@ -38,8 +38,18 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
+    # Half of the time that a processor takes to draw.
+    "--webgl-antialiasing-mode=none",
+    "--webgl-msaa-sample-count=0",
+    "--disable-features=SpareRendererForSitePerProcess",  # a process for each tab that is not opened
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1 , EXCLUDE localhost",
 )
+SLOW_FRAMES = """
+    const onNextFrame = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = (draw) => setTimeout(() => onNextFrame(draw), 250);
+    window.cancelAnimationFrame = clearTimeout;
+"""
+"""The page draws in a loop, which would keep the processors busy that other tests wait for."""
 TIMEOUT_MS = 45_000.0
 """A browser without a graphics card, on a busy machine."""
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -119,6 +129,7 @@ def open_tab(browser: Browser) -> Iterator[Callable[..., BrowserTab]]:
 
     def opened(url: str, width: int = 800, height: int = 500) -> BrowserTab:
         tab = browser.new_page(viewport={"width": width, "height": height})
+        tab.add_init_script(SLOW_FRAMES)
         view_tab = BrowserTab(tab)
         view_tabs.append(view_tab)
         tab.on("pageerror", lambda error: view_tab.errors.append(str(error)))

@@ -244,7 +244,9 @@ def test_unsupported_format_error_lists_supported_formats(tmp_path):
 
 
 @pytest.mark.robots
-@pytest.mark.parametrize("name", ["panda", "talos", "ur5", "anymal_c"])
+@pytest.mark.parametrize(
+    "name", ["panda", "ur5", *(pytest.param(name, marks=pytest.mark.soak) for name in ("talos", "anymal_c"))]
+)
 @pytest.mark.long
 def test_all_meshes_of_known_robots_are_found(name):
     meshes = Meshes()

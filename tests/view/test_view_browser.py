@@ -48,7 +48,15 @@ def standing(session: Session, robot: str) -> Iterator[None]:
 
 
 def field(view_tab, label: str):
-    return view_tab.tab.locator(f'xpath=//label[normalize-space(.)="{label}"]/ancestor::div[2]//input').last
+    path = f'//label[normalize-space(.)="{label}"]/ancestor::div[2]//input[not(@type="hidden")]'
+    return view_tab.tab.locator(f"xpath={path}").last
+
+
+def choose(view_tab, label: str, option: str) -> None:
+    """Selects an option of a dropdown by typing it."""
+    field(view_tab, label).click()
+    field(view_tab, label).fill(option)
+    view_tab.tab.get_by_role("option", name=option, exact=True).click()
 
 
 def shape_of(view_tab) -> tuple[int, int]:
@@ -102,7 +110,7 @@ def pixels_of(points: NDArray[np.float64], framing: CameraPose, size: tuple[int,
 
 
 @pytest.mark.robots
-@pytest.mark.parametrize("robot", ["panda", "talos"])
+@pytest.mark.parametrize("robot", ["panda", pytest.param("talos", marks=pytest.mark.soak)])
 def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab, show_view, sessions):
     with standing(sessions[0], robot):
         shown = show_view(sessions[1])
@@ -198,10 +206,13 @@ def test_several_browsers_share_one_page_until_the_last_disconnects(open_tab, sh
         until(lambda: len(shown.page.server.get_clients()) == 1)
         assert shown.page.connected.is_set()
         # All browsers share the widgets of one page.
-        field(view_tabs[1], "Names").click()
-        until(lambda: shown.view.scene.names)
         third = open_tab(shown.page.url, 640, 400)
+        assert not field(third, "Names").is_checked()
+        field(view_tabs[1], "Names").click()
+        choose(view_tabs[1], "Fixed frame", "rrbot/tool")
+        until(lambda: shown.view.scene.names)
         until(lambda: field(third, "Names").is_checked())
+        until(lambda: field(third, "Fixed frame").input_value() == "rrbot/tool")
         third.tab.close()
         view_tabs[1].tab.close()
         until(lambda: not shown.page.connected.is_set())

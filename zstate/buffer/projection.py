@@ -57,6 +57,9 @@ def project_rows(
     """
     last_row = camera.height - 1
     rows = np.full(count, last_row / 2)
+    pixels = np.full((count, 2), np.nan)
+    valid: NDArray[np.bool_] = np.zeros(count, np.bool_)
+    is_settled: NDArray[np.bool_] = valid
     rows_before, error_before = np.full(count, np.nan), np.full(count, np.nan)
     for _ in range(_STEPS):
         stamps = stamp + np.rint(rows * camera.line_time_ns).astype(np.int64)
@@ -72,6 +75,6 @@ def project_rows(
             step = np.where(np.abs(slope) > _FLAT, -error / slope, error)  # at first the row of the pixel
         rows_before, error_before = rows, error
         rows = np.clip(rows + step, 0.0, last_row)
-    valid &= is_settled
+    valid = valid & is_settled
     pixels[~valid] = np.nan
     return pixels, valid

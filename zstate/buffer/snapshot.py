@@ -199,7 +199,7 @@ class SnapshotReader:
         for row, edge in enumerate(edges):
             if edge is not None and edge.track is not None:
                 places.setdefault(edge.track, []).append((row, edge.index))
-        # Of each track: row ``rows[k]`` of the table is edge ``edges[k]`` of the track.
+        # By track: row ``rows[k]`` of the table is edge ``edges[k]`` of the track.
         self._parts = {track: np.array(pairs, dtype=np.intp).T for track, pairs in places.items()}
         self._writers = [track.writer for track in self._parts]
 

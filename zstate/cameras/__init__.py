@@ -5,9 +5,18 @@ from typing import TYPE_CHECKING
 from zstate._util.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from zstate.cameras.calibration_file import load_camera
     from zstate.cameras.camera import Camera
     from zstate.cameras.listener import CameraListener, Picture
-    from zstate.cameras.publishers import CameraInfoPublisher, CameraPublisher
+    from zstate.cameras.publishers import (
+        CameraInfoPublisher,
+        CameraPublisher,
+        PictureSource,
+        StampedPicture,
+    )
+    from zstate.cameras.ros_images import RosImage, RosImageListener
+    from zstate.cameras.simulated_camera import SimulatedCamera
+    from zstate.cameras.surfaces import Surface, floor_surface, robot_surfaces, wall_surface
 
 __all__ = [
     "Camera",
@@ -15,6 +24,16 @@ __all__ = [
     "CameraListener",
     "CameraPublisher",
     "Picture",
+    "PictureSource",
+    "RosImage",
+    "RosImageListener",
+    "SimulatedCamera",
+    "StampedPicture",
+    "Surface",
+    "floor_surface",
+    "load_camera",
+    "robot_surfaces",
+    "wall_surface",
 ]
 
 _HOMES = {
@@ -23,6 +42,16 @@ _HOMES = {
     "CameraListener": "listener",
     "CameraPublisher": "publishers",
     "Picture": "listener",
+    "PictureSource": "publishers",
+    "RosImage": "ros_images",
+    "RosImageListener": "ros_images",
+    "SimulatedCamera": "simulated_camera",
+    "StampedPicture": "publishers",
+    "Surface": "surfaces",
+    "floor_surface": "surfaces",
+    "load_camera": "calibration_file",
+    "robot_surfaces": "surfaces",
+    "wall_surface": "surfaces",
 }
 
 if not TYPE_CHECKING:  # type checkers would take any name for one of the package

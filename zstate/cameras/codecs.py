@@ -63,7 +63,7 @@ class VideoDecoder:
 
     def __init__(self, form: PictureFormat) -> None:
         self.form: PictureFormat = form
-        self._av = _pyav()
+        self._av = pyav()
         self._decoder: Any = None
 
     def skip(self) -> None:
@@ -102,7 +102,7 @@ def _simplejpeg() -> Any:
     return simplejpeg
 
 
-def _pyav() -> Any:
+def pyav() -> Any:
     """The module. Raises LibraryMissing."""
     try:
         import av  # noqa: PLC0415 - loaded when it is needed

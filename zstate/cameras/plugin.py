@@ -1,6 +1,6 @@
-"""What cameras bring: the streams of pictures and of calibrations."""
+"""What cameras bring: the streams of pictures and of calibrations; and a command."""
 
-from zstate.plugins import Plugin
+from zstate.plugins import Command, Plugin
 from zstate.streams import MEGABYTE, Stream
 
 _MESSAGES = "zstate.cameras.messages"
@@ -11,8 +11,9 @@ IMAGE = Stream(
     summary="pictures of a camera, compressed",
     named=True,
     bulk=True,
+    private=True,
     max_bytes=16 * MEGABYTE,
-    start="start the program of the camera, with its zstate.cameras.CameraPublisher",
+    start="start one: `zstate camera {robot} --device /dev/video0`",
     ros="zstate.cameras.ros2:IMAGE_STREAM",
     document="zstate.cameras.documents:image_document",
 )
@@ -22,9 +23,24 @@ CAMERA_INFO = Stream(
     summary="the calibration of a camera",
     named=True,
     latched=True,
-    start="start the program of the camera, with its zstate.cameras.CameraPublisher",
+    start="start one: `zstate camera {robot} --device /dev/video0`",
     ros="zstate.cameras.ros2:CAMERA_INFO_STREAM",
     document="zstate.cameras.documents:camera_info_document",
 )
 
-PLUGIN = Plugin("cameras", streams=(IMAGE, CAMERA_INFO))
+PLUGIN = Plugin(
+    "cameras",
+    streams=(IMAGE, CAMERA_INFO),
+    commands={
+        "camera": Command(
+            "zstate.cameras.cli.camera:camera_command",
+            "Write",
+            "Publish the pictures of a camera, a video file or a simulated camera.",
+        ),
+    },
+    synonyms={
+        "usb_cam": "camera ROBOT --device /dev/video0",
+        "v4l2_camera": "camera ROBOT --device /dev/video0",
+        "webcam": "camera ROBOT --device /dev/video0",
+    },
+)

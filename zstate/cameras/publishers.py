@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 from numpy.typing import ArrayLike
 
@@ -18,11 +19,27 @@ from zstate.nodes.robot_writer import RobotWriter
 from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.plugins import stream_named
+from zstate.rate import RateReport
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import renumbered
 
 _ENVELOPE_BYTES = 5_000
 """What a message has beside its picture, at most: names of 1024 characters of 4 bytes."""
+
+
+class StampedPicture(NamedTuple):
+    """A picture as ``CameraPublisher.publish`` takes it; ``stamp`` [ns] is the instant of its first row."""
+
+    stamp: int
+    picture: bytes | ArrayLike
+
+
+class PictureSource(Protocol):
+    """Interface of programs that take pictures: drivers of cameras, simulators."""
+
+    def read(self, stamp: int) -> StampedPicture | None:
+        """The newest picture at ``stamp`` [ns]; None when there is nothing new."""
+        ...
 
 
 class CameraPublisher(MeasurementPublisher):
@@ -91,6 +108,19 @@ class CameraPublisher(MeasurementPublisher):
                 raise InvalidInput(str(error)) from None
             self._check(message)
             self._send(message)
+
+    def run(
+        self, source: PictureSource, rate_hz: float = 30.0, *, seconds: float | None = None
+    ) -> RateReport:
+        """Publish the pictures of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
+
+        Raises as ``publish``; late ticks are those of ``StatePublisher.run``.
+        """
+
+        def publish(picture: StampedPicture, _: int) -> None:
+            self.publish(picture.picture, picture.stamp)
+
+        return self._publish_at(rate_hz, seconds, source.read, publish)
 
     def _check(self, message: CompressedImage) -> None:
         if len(message.data) > self._max_bytes:

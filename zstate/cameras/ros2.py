@@ -1,4 +1,8 @@
-"""Pictures and calibrations as ROS 2 messages, and raw pictures of ROS."""
+"""Pictures and calibrations as ROS 2 messages, and raw pictures of ROS.
+
+Foxglove displays videos as foxglove_msgs/CompressedVideo alone, and has a name of its own for the model
+``equidistant``; recordings have its form of a video, which foxglove_compressed_video_transport has as well.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +18,14 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import from_block, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
-from zstate.wire.ros2.streams import RosStream
+from zstate.wire.ros2.streams import DisplayedForm, RosStream
 from zstate.wire.ros2.topics import FrameNames
-from zstate.wire.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from zstate.wire.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, COMPRESSED_VIDEO, IMAGE
 
 _VIDEO: tuple[PictureFormat, ...] = ("h264", "h265")
 _REGION = struct.Struct("<4I")
 _REGION_NUMBERS = 4
+_EQUIDISTANT_IN_FOXGLOVE = "kannala_brandt"
 _CHANNELS = {
     "rgb8": (0, 1, 2),
     "bgr8": (2, 1, 0),
@@ -67,11 +72,63 @@ def decode_image(payload: bytes, session: int, seq: int, names: FrameNames) -> C
         raise reader.malformed(str(error)) from None
 
 
+def encode_video(packet: CompressedImage, names: FrameNames) -> bytes:
+    """The foxglove_msgs/CompressedVideo of a packet of H.264 or H.265.
+
+    Raises InvalidInput if CDR cannot represent it.
+    """
+    writer = CdrWriter()
+    writer.stamp(packet.stamp)
+    writer.text(names.to_ros(packet.frame))
+    writer.sequence(packet.data, 1)
+    writer.text(packet.format)
+    return writer.payload()
+
+
+def decode_video(payload: bytes, session: int, seq: int, names: FrameNames) -> CompressedImage:
+    """The packet in a foxglove_msgs/CompressedVideo.
+
+    Raises MessageError with the reason "truncated", "malformed", or "foreign" for another format.
+    """
+    reader = CdrReader(payload, COMPRESSED_VIDEO.name)
+    stamp, frame, data, text = (
+        reader.stamp(),
+        names.to_zstate(reader.text()),
+        reader.sequence(1),
+        reader.text(),
+    )
+    form: PictureFormat | None = next((one for one in _VIDEO if one == text), None)
+    if form is None:
+        known = ", ".join(_VIDEO)
+        raise MessageError(f"a {COMPRESSED_VIDEO.name} of {text!r}; known are {known}", reason="foreign")
+    try:
+        return CompressedImage(stamp, seq, session, frame, form, data)
+    except InvalidInput as error:
+        raise reader.malformed(str(error)) from None
+
+
+def _is_video(image: CompressedImage) -> bool:
+    return image.format in _VIDEO
+
+
 def encode_camera_info(info: CameraInfo, names: FrameNames) -> bytes:
     """The sensor_msgs/CameraInfo of a calibration, which does not have ``line_time_ns``.
 
     Raises InvalidInput if CDR cannot represent it.
     """
+    return _encode_camera_info(info, names, info.model)
+
+
+def encode_displayed_camera_info(info: CameraInfo, names: FrameNames) -> bytes:
+    """The same with Foxglove's name of the model ``equidistant``."""
+    return _encode_camera_info(info, names, _EQUIDISTANT_IN_FOXGLOVE)
+
+
+def _is_equidistant(info: CameraInfo) -> bool:
+    return info.model == "equidistant"
+
+
+def _encode_camera_info(info: CameraInfo, names: FrameNames, model: str) -> bytes:
     fx, fy, cx, cy = from_block(info.k).tolist()
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, float(info.is_calibrated)]])
     writer = CdrWriter()
@@ -79,7 +136,7 @@ def encode_camera_info(info: CameraInfo, names: FrameNames) -> bytes:
     writer.text(names.to_ros(info.frame))
     writer.count(info.height)
     writer.count(info.width)
-    writer.text(info.model)
+    writer.text(model)
     writer.sequence(info.d)
     writer.numbers(to_block(matrix))
     writer.numbers(info.r or to_block(np.eye(3)))
@@ -105,7 +162,8 @@ def decode_camera_info(payload: bytes, session: int, seq: int, names: FrameNames
     left, top, rows, columns = _REGION.unpack(reader.numbers(_REGION_NUMBERS, 4))
     reader.numbers(1, 1)
     sent_from_sensor = np.array([[1.0 / x, 0.0, -left / x], [0.0, 1.0 / y, -top / y], [0.0, 0.0, 1.0]])
-    k, p = sent_from_sensor @ k, sent_from_sensor @ p
+    with np.errstate(all="ignore"):  # what is not finite is malformed below
+        k, p = sent_from_sensor @ k, sent_from_sensor @ p
     if not k.any():  # not calibrated: drivers put any model and numbers beside that
         model, d = "plumb_bob", b""
     elif k[0, 1] or k[1, 0] or k[2].tolist() != [0.0, 0.0, 1.0]:
@@ -137,10 +195,12 @@ def decode_raw_image(payload: bytes, names: FrameNames) -> tuple[int, str, NDArr
     """The stamp [ns], the frame and the pixels of a sensor_msgs/Image, which the payload holds.
 
     The pixels are RGB (H, W, 3), or gray (H, W). Raises MessageError with the reason "truncated",
-    "malformed", "too large", or "foreign" for an encoding without 8 bits a channel.
+    "malformed", "too large", "no stamp", or "foreign" for an encoding without 8 bits a channel.
     """
     reader = CdrReader(payload, IMAGE.name)
     stamp, frame = reader.stamp(), names.to_zstate(reader.text())
+    if not stamp:
+        raise MessageError(f"the stamp of a {IMAGE.name} is zero, which means none in ROS", reason="no stamp")
     height, width, encoding = reader.count(), reader.count(), reader.text()
     reader.numbers(1, 1)  # the order of bytes, of which each channel has one
     step = reader.count()
@@ -174,6 +234,8 @@ IMAGE_STREAM = RosStream(
     suffix="image_raw/compressed",
     encode=encode_image,
     decode=decode_image,
+    # The name of foxglove_compressed_video_transport among the transports of a camera.
+    displayed=DisplayedForm(COMPRESSED_VIDEO, "image_raw/foxglove", _is_video, encode_video, decode_video),
 )
 CAMERA_INFO_STREAM = RosStream(
     CAMERA_INFO,
@@ -184,5 +246,7 @@ CAMERA_INFO_STREAM = RosStream(
     encode=encode_camera_info,
     decode=decode_camera_info,
     withdrawn=_WITHDRAWN,
+    uncarried_number="line_time_ns",
     is_withdrawn=_has_no_camera,
+    displayed=DisplayedForm(CAMERA_INFO, "camera_info", _is_equidistant, encode_displayed_camera_info),
 )

@@ -1,7 +1,7 @@
 """Entry point of the command line: loads and completes commands, handles signals and exit codes.
 
-A command line that is invalid is answered with a hint: names and forms of ROS tools, unquoted paths,
-misspelled options.
+The error of an invalid command line has a hint: names and forms of ROS tools, unquoted paths, misspelled
+options.
 """
 
 from __future__ import annotations

@@ -433,6 +433,12 @@ rate_option = click.option("--rate", type=RATE, default=100.0, show_default=True
 seconds_option = click.option("--seconds", type=SECONDS, metavar="N", help="End after N seconds.")
 
 
+def check_end(seconds: float | None, *, once: bool) -> None:
+    """Refuse --seconds of a command that ends by itself with --once."""
+    if once and seconds is not None:
+        raise click.UsageError("--seconds is for output that goes on; --timeout limits the wait for one")
+
+
 def _check_placer(name: str) -> str:
     from zstate.wire.keys import check_robot
 

@@ -1,8 +1,11 @@
-"""Clouds as documents, which `zstate echo` prints."""
+"""Clouds as documents, which `zstate echo` prints, and as columns, which `zstate export` writes."""
 
 from __future__ import annotations
 
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from zstate.clouds.cloud import cloud_from_message
 from zstate.clouds.messages import PointCloud
@@ -31,3 +34,25 @@ def cloud_document(message: PointCloud, robot: str) -> dict[str, Any]:
         "compression": message.compression or None,
         "resolution": message.resolution or None,
     }
+
+
+def cloud_columns(message: PointCloud, robot: str) -> dict[str, NDArray[Any]]:
+    """A row for each point: its ``stamp`` [ns], that of its ``cloud`` [ns], and its fields.
+
+    A packed ``rgb`` or ``rgba`` becomes ``red``, ``green`` and ``blue``; a field with several numbers has the
+    columns ``name.0``, ``name.1`` ...
+    """
+    cloud = cloud_from_message(message, robot)
+    stamps, colours = cloud.stamps, cloud.rgb
+    cloud_stamps = np.full(len(cloud), cloud.stamp)
+    columns: dict[str, NDArray[Any]] = {"stamp": cloud_stamps if stamps is None else stamps}
+    columns["cloud"] = cloud_stamps
+    for name in cloud.points.dtype.names or ():
+        if name in ("rgb", "rgba") and colours is not None:
+            columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
+            continue
+        values = cloud.points[name].reshape(len(cloud), -1)
+        own = f"message.{name}" if name in columns else name
+        names = [own] if values.shape[1] == 1 else [f"{own}.{item}" for item in range(values.shape[1])]
+        columns |= dict(zip(names, values.T, strict=True))
+    return columns

@@ -16,6 +16,7 @@ CLOUD = Stream(
     start="start one: `zstate cloud {robot} --frame FRAME --simulate`",
     ros="zstate.clouds.ros2:CLOUD_STREAM",
     document="zstate.clouds.documents:cloud_document",
+    columns="zstate.clouds.documents:cloud_columns",
 )
 
 PLUGIN = Plugin(

@@ -39,10 +39,10 @@ class CloudPublisher(MeasurementPublisher):
     ``sensor`` is its name, in ROS its topic. Its frame is ``frame``, by default a frame of the sensor's name;
     a bare name is the robot's own.
 
-    ``compression``, "lz4" or "zstd", is for networks that are slower than it: LZ4 takes half of the time of
-    Zstandard, and a third more bytes. Nothing is lost unless a ``resolution`` [m] is given: x, y and z are
-    rounded to its multiples, and change by half of it at most. It has no effect on the wires of ROS, which
-    have no compression, but for the rounding.
+    ``compression``, "lz4" or "zstd", is for networks that are slower than it: Zstandard takes a third longer
+    than LZ4, for 13 to 45 % fewer bytes. Nothing is lost unless a ``resolution`` [m] is given: x, y and z are
+    rounded to its multiples, and change by half of it at most. On the wires of ROS, which have no
+    compression, clouds are rounded in the same way.
 
     Clouds give way to all other streams: they are sent after them, and under congestion dropped. Joining
     listeners receive none from the past. On the native wire each sensor has one writer: SecondWriter, which

@@ -187,10 +187,11 @@ class Commander(Closeable):
         velocities: Mapping[str, float] | None = None,
         efforts: Mapping[str, float] | None = None,
     ) -> None:
-        """Send positions [rad] or [m], velocities per s, or efforts [Nm] or [N] by joint; returns at once.
+        """Send ``positions`` [rad] or [m], ``velocities`` per s, or ``efforts`` [Nm] or [N]; returns at once.
 
-        Each joint has one of them; others keep their commands. They are valid for ``ttl_s`` [s], by default
-        and at most for the driver's own limit: then the driver holds the joints, wheels at zero velocity.
+        They are by joint. Each joint has one of them; others keep their commands. They are valid for
+        ``ttl_s`` [s], by default and at most for the driver's own limit: then the driver holds the joints,
+        wheels at zero velocity.
         Send again before. The driver refuses positions outside limits, and modes that it does not have, and
         exceeds no limit of position, velocity, acceleration and effort: a joint in mode "velocity" arrives at
         its position limit at rest, one in mode "effort" that leaves its range or exceeds its velocity limit

@@ -130,9 +130,9 @@ class ControlLoop:
         self._powered_ticks = 0
         """Since the joints have power, without a setpoint."""
         self._read_stamp: int | None = None
-        """Of the last reading, if the driver gives stamps."""
+        """The stamp of the last reading, if the driver gives stamps."""
         self._offset = 0
-        """Of the system clock ahead of ``clock`` [ns], at the last tick."""
+        """How far the system clock was ahead of ``clock`` at the last tick [ns]."""
         self._faults_in_row = 0
 
     def start(self) -> None:

@@ -75,8 +75,8 @@ class DriverReport:
     """The figures of a driver host since it opened; ``rate`` and ``lateness_us`` of its last ``run``.
 
     ``lateness_us`` is how long ticks began after their deadlines, zero if a device sets the pace; ``read_us``
-    and ``write_us`` are what the driver's own calls took. ``faults`` counts those that raised. ``refused``
-    counts commands by reason.
+    and ``write_us`` are what the driver's own calls took. ``written`` counts the setpoints that were written,
+    ``faults`` the calls that raised, ``refused`` commands by reason.
     """
 
     rate: RateReport | None

@@ -33,7 +33,11 @@ class Outcome(NamedTuple):
 
 
 class Motion:
-    """A motion that the driver of ``robot`` has accepted, see ``Commander.move``. Safe from any thread."""
+    """A motion that the driver of ``robot`` has accepted. ``Commander.move`` makes it.
+
+    ``identity`` is the session of the commander and the number of the motion, ``host_session`` that of the
+    driver host. ``cancel()`` ends the motion there. Safe from any thread.
+    """
 
     def __init__(
         self, robot: str, identity: tuple[int, int], host_session: int, cancel: Callable[[], None]

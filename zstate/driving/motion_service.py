@@ -207,7 +207,7 @@ class MotionExecutor:
         self._newest: BoundedDict[int, int] = BoundedDict()
         """The number of the last motion that was started, by session."""
         self.outcomes: tuple[MotionOutcome, ...] = ()
-        """Of the last motions, newest last; a new tuple after each. May be read from any thread."""
+        """Those of the last motions, newest last; a new tuple after each. May be read from any thread."""
 
     def set_announced(self, session: int, alive: bool) -> None:
         """The ROS node of ``session`` is announced, or not any more; for any thread."""

@@ -63,7 +63,7 @@ class DevicePace:
     """
 
     lateness_ns = 0
-    """Of the current tick, which has no deadline."""
+    """Always 0: a tick has no deadline."""
 
     def __init__(self, clock: Clock, stop: threading.Event, seconds: float | None = None) -> None:
         self._longest_ns = check_seconds(seconds) * 1e9

@@ -21,7 +21,7 @@ _LAG_S = 0.05
 """Time constant of the plant "lag"."""
 
 _NATURAL_FREQUENCY = 60.0
-"""Of the position controller of the plant "dynamics" [rad/s]; critically damped."""
+"""That of the position controller of the plant "dynamics" [rad/s]; critically damped."""
 
 _STEP_S = 0.001
 _LONGEST_STEP_S = 0.1

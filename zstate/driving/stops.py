@@ -59,7 +59,7 @@ _MOST_DISPLACED = 256
 _MOST_RELEASED = 32
 _MOST_SENT = 64
 _MOST_WAITING = 1024
-"""Of the stops that arrive; in a flood the newest waits for as many others."""
+"""The most stops that wait; in a flood the newest one waits for as many others."""
 
 _STEP_BITS = 32
 _REPEAT_S = 0.25
@@ -79,10 +79,11 @@ def stop(
 ) -> DriverState:
     """Stop the driver of ``robot``, and return its state once it has stopped.
 
-    The driver stays stopped, also if it or this program restarts, until ``Commander.release``. "hold" leaves
-    the joints where they are, "relax" without torque: behind a router with access control only commanders and
-    operators switch it off, and the joints hold for others. ``reason`` is shown to users; it is cut after
-    1000 characters, and no text makes a stop fail. No claim is needed. Not a safety-rated channel.
+    The driver stays stopped, also if it or this program restarts, until ``Commander.release``. ``how`` "hold"
+    (the default) leaves the joints where they are, "relax" without torque: behind a router with access
+    control only commanders and operators switch it off, and the joints hold for others. ``reason`` is shown
+    to users; it is cut after 1000 characters, and no text makes a stop fail. No claim is needed. Not a
+    safety-rated channel.
 
     It is repeated until a driver has confirmed it. Raises Unreachable if none has within ``timeout_s`` [s].
     The stop stays latched in ``session`` then: a driver that can be reached later obeys it.
@@ -224,7 +225,7 @@ class LatchedStops(NamedTuple):
 class StopRegister:
     """The stops of the driver of ``host`` that are not released. Safe from any thread.
 
-    Each ends by its own release only. Of more than are kept, the oldest are replaced by one stop of the host,
+    Each ends by its own release only. If there are too many, the oldest are replaced by one stop of the host,
     with another number for each, so that no release of it ends a stop that came later.
     """
 
@@ -345,8 +346,8 @@ class StopLatch(StopRegister, Closeable):
     """The stops of the driver of ``robot`` that are not released, from the network.
 
     They are kept in ``stops_file``, which a restarted host reads, and are read from the caches of programs
-    that have sent them. A file that cannot be read counts as a stop, and a damaged one is kept beside it; one
-    that cannot be written raises ConfigError here, and is logged later. While it is open, it has the
+    that have sent them. A file that cannot be read counts as a stop, and a damaged one is kept next to it;
+    one that cannot be written raises ConfigError here, and is logged later. While it is open, it has the
     ``HostLock`` of the robot; raises SecondWriter if another host has that. ``host`` is the program of this
     host, ``refusals`` counts invalid messages.
     """

@@ -141,7 +141,7 @@ class FollowingCheck:
         self._setpoint: Limited | None = None
         self._written_at = 0
         self._travel: _Travel | None = None
-        """Of the joints in mode "velocity", since the last comparison."""
+        """The travel of the joints in mode "velocity" since the last comparison."""
 
     def written(self, setpoint: Limited, now: int) -> None:
         """``setpoint`` has been written at ``now``."""

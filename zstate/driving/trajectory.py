@@ -36,8 +36,8 @@ from zstate.errors import InvalidInput
 from zstate.model.robot import near_joint
 
 _LEAST_LEADING = 1e-8
-"""Of the largest coefficient. Adds a root far outside of 0 to 1 to a polynomial of a lower degree, and moves
-the others by as little: values at extrema change by its square."""
+"""The least leading coefficient, as a part of the largest. Adds a root far outside of 0 to 1 to a polynomial
+of a lower degree, and moves the others by as little: values at extrema change by its square."""
 
 _NO_SIZE = 1e-200
 """Largest coefficient of a polynomial that counts as zero."""

@@ -28,7 +28,7 @@ from zstate.driving.messages import DriverState
 from zstate.errors import MessageError, format_duration
 
 _MOST_DRIFT = 1e-3
-"""Of a clock against another: above what NTP slews by, 500 ppm, and an oscillator is off by."""
+"""The most drift between two clocks: above what NTP slews by, 500 ppm, and an oscillator is off by."""
 
 _KEPT_NS = 10_000_000_000
 """For so long a state of the driver is used in place of those that took longer."""
@@ -189,7 +189,7 @@ class DriverClock:
 
     def __init__(self) -> None:
         self.session: int = 0
-        """Of the driver's host; 0 before its first state."""
+        """The session of the driver's host; 0 before its first state."""
         self._offset: int = 0
         self._measured_at: int = 0
 

@@ -25,7 +25,7 @@ from typing import Any
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
-from zstate.plugins import is_named, latched_streams
+from zstate.plugins import all_streams, is_named, latched_streams, own_streams
 from zstate.wire.keys import (
     CLOCK_KEY,
     EDGE_TOKEN,
@@ -60,14 +60,16 @@ class AclRoles:
     """Roles of identities behind a router, by name: the common name of a certificate, or a user.
 
     A robot writes and reads its own keys; of other robots it reads their names, their static edges, which it
-    must not contradict, their maps, as those of places, their datums, and the states of their drivers; and it
-    reads the simulated time. A viewer reads everything and writes nothing but stops of drivers, which every
-    identity may send: the joints hold. A commander also commands joints, releases stops, resets and places an
-    odometry, and may switch the torque off; an operator does, too, and calls services of ROS; a timekeeper
-    also writes the simulated time. A placer writes only static edges under its own name, and reads those of
-    the robots: it places their roots, as in ``fleet/map -> r1/odom``; readers with ``placers=`` accept such
-    edges from these only. A name may have several roles. ``namespace`` is that of the sessions behind the
-    router, if they have one. ``wires``: "native", and "ros2" with its options, see
+    must not contradict, their maps, as those of places, their datums, the calibrations of their cameras, and
+    the states of their drivers; and it reads the simulated time. A viewer reads everything and writes nothing
+    but stops of drivers, which every identity may send: the joints hold. A state viewer is one that does not
+    read what shows people and places (``Stream.private``), such as pictures; of other packages it reads the
+    streams of those that are installed where the rules are made. A commander also commands joints, releases
+    stops, resets and places an odometry, and may switch the torque off; an operator does, too, and calls
+    services of ROS; a timekeeper also writes the simulated time. A placer writes only static edges under its
+    own name, and reads those of the robots: it places their roots, as in ``fleet/map -> r1/odom``; readers
+    with ``placers=`` accept such edges from these only. A name may have several roles. ``namespace`` is that
+    of the sessions behind the router, if they have one. ``wires``: "native", and "ros2" with its options, see
     ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
     """
@@ -80,6 +82,7 @@ class AclRoles:
     wires: tuple[str, ...] = ("native",)
     placers: tuple[str, ...] = ()
     commanders: tuple[str, ...] = ()
+    state_viewers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in self.identities:
@@ -91,7 +94,7 @@ class AclRoles:
     @property
     def identities(self) -> tuple[str, ...]:
         """All names, each once."""
-        return tuple(dict.fromkeys((*self.robots, *self.readers, *self.placers)))
+        return tuple(dict.fromkeys((*self.robots, *self.readers, *self.state_viewers, *self.placers)))
 
     @property
     def readers(self) -> tuple[str, ...]:
@@ -162,6 +165,9 @@ def _native_rules(roles: AclRoles) -> Grants:
     yield robots, _egress("robots are asked", SUBSCRIBE, (*everything, *requests))
     yield roles.readers, _ingress("viewers read", SUBSCRIBE, everything)
     yield roles.readers, _egress("viewers are given", PUBLISH, everything)
+    states = _states(root)
+    yield roles.state_viewers, _ingress("state viewers read", SUBSCRIBE, states)
+    yield roles.state_viewers, _egress("state viewers are given", PUBLISH, states)
     yield roles.identities, _ingress("readers are known", ("liveliness_token",), (f"{root}/{_READER}/**",))
     streams = ("joint_commands", "release/*", f"{_WRITER}/joint_commands/*")
     commands = tuple(f"{root}/*/{stream}" for stream in streams)
@@ -184,12 +190,22 @@ def _below(key: str) -> tuple[str, ...]:
     return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _VERBATIM))
 
 
+def _states(root: str) -> tuple[str, ...]:
+    """What viewers read without the streams that are private."""
+    rows = [row for row in all_streams() if not row.private and row.group != "time"]
+    streams = [f"{root}/*/{row.name}{'/*' if row.named else ''}" for row in rows]
+    cached = [f"{key}/@adv/**" for key in streams]
+    tokens = [f"{root}/**/{chunk}/**" for chunk in _VERBATIM if chunk != "@adv"]
+    return (*streams, *cached, *tokens, f"{root}/*/status/*", f"{root}/*/lookup", f"{root}/clock")
+
+
 class _Ros2Rules:
     """The rules in one ROS domain, where each robot has a namespace.
 
     A robot writes the topics of its namespace, serves its services, and announces only these in the graph;
     global /tf and /tf_static belong to all robots, and all robots read the maps in other namespaces. A viewer
-    subscribes to all topics and calls no service; an operator does. A commander writes
+    subscribes to all topics and calls no service; an operator does. A state viewer subscribes to the
+    topics whose types are those of streams that are not private. A commander writes
     ``<controller>/commands`` and ``<controller>/joint_trajectory`` of all robots. Raises InvalidInput for
     robots in one namespace.
     """
@@ -231,10 +247,15 @@ class _Ros2Rules:
         # A query for all robots goes to each of them; a reply has the robot's own data only.
         yield roles.robots, _egress(self._id("robots are asked"), SUBSCRIBE, everything)
         viewers = (*(f"{self._graph}/*/*/*/{kind}/**" for kind in _READING), f"{self._domain}/**/@adv/sub/**")
-        yield roles.readers, _ingress(self._id("viewers are known"), ("liveliness_token",), viewers)
         yield roles.readers, _ingress(self._id("viewers subscribe"), ("declare_subscriber",), (topics,))
         yield roles.readers, _ingress(self._id("viewers ask"), SUBSCRIBE, (history, graph))
         yield roles.readers, _egress(self._id("viewers are given"), PUBLISH, everything)
+        kinds = {row.ros_form.type.dds for row in own_streams() if row.ros and not row.private}
+        states = [f"{self._domain}/**/{kind}/*{end}" for kind in sorted(kinds) for end in ("", "/@adv/**")]
+        yield roles.state_viewers, _ingress(self._id("state viewers read"), SUBSCRIBE, (*states, graph))
+        yield roles.state_viewers, _egress(self._id("state viewers are given"), PUBLISH, (*states, graph))
+        known = (*roles.readers, *roles.state_viewers)
+        yield known, _ingress(self._id("viewers are known"), ("liveliness_token",), viewers)
         yield roles.operators, _ingress(self._id("operators call"), ("query",), (topics,))
         topics_in = {"commands": FLOAT64_MULTI_ARRAY, "joint_trajectory": JOINT_TRAJECTORY}
         commands = [f"{self._domain}/**/{name}/{kind.dds}/*" for name, kind in topics_in.items()]

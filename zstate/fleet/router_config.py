@@ -201,6 +201,7 @@ def access_text(roles: AclRoles) -> str:
     names = {
         "robots": roles.robots,
         "viewers": roles.viewers,
+        "states only": roles.state_viewers,
         "operators": roles.operators,
         "commanders": roles.commanders,
         "timekeepers": roles.timekeepers,

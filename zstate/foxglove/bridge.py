@@ -254,7 +254,7 @@ class FoxgloveBridge(Closeable):
                 return None
         others = robots - {SHARED}
         alone = others.pop() if len(others) == 1 else None
-        return RecordingEncoder(self._topics, self._counters.count_refusal, alone=alone)
+        return RecordingEncoder(self._topics, self._counters.count_refusal, alone=alone, for_viewer=True)
 
     def _update_channels(self, encoder: RecordingEncoder) -> None:
         """Open and close the channels of the writers that have come and gone."""
@@ -296,8 +296,8 @@ class FoxgloveBridge(Closeable):
         topics: list[tuple[str, ChannelType, Feed]] = []
         try:
             for of_topic, of_messages in carried:
-                topic, kind, _ = encoder.topic(robot, of_topic, name)
-                topics.append((topic, kind, (robot, of_messages)))
+                for topic, (kind, _) in encoder.topics(robot, of_topic, name).items():
+                    topics.append((topic, kind, (robot, of_messages)))
         except InvalidInput as error:
             self._counters.count_refusal("not representable", f"{robot!r}: {error}")
         return topics

@@ -65,7 +65,7 @@ class StreamIngest(ABC):
         self._descriptions = SessionDescriptions()
         self._numbers = SequenceNumbers()
         self._early = EarlySamples()
-        # Of the epoch: its newest stamp, and the last sample that was too late for it.
+        # The newest stamp of the epoch, and the last sample that was too late for it.
         self._newest: int | None = None
         self._last_late: Sample | None = None
         self._has_joined_domain = False

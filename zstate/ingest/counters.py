@@ -179,11 +179,13 @@ class GapCounter:
         if overflowed:
             self._overflowed = set(self._next)
 
-    def add(self, writer: Hashable, seq: int) -> None:
-        """Count what is missing before sample ``seq`` of ``writer``."""
+    def add(self, writer: Hashable, seq: int) -> int:
+        """Count what is missing before sample ``seq`` of ``writer``, and return how many these are."""
         expected = self._next.get(writer, seq)
-        if seq > expected:
+        missing = max(seq - expected, 0)
+        if missing:
             is_own = self._is_overflowed or writer in self._overflowed
-            self._counters.count("dropped" if is_own else "missed", seq - expected)
+            self._counters.count("dropped" if is_own else "missed", missing)
         self._overflowed.discard(writer)
         self._next[writer] = max(seq + 1, expected)
+        return missing

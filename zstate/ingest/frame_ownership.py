@@ -5,7 +5,7 @@ keys, whatever name they announce. Other writers may place a robot's root, the f
 writers places, in frames of theirs. A prefix that is no robot on the network, such as the ``fleet`` of
 ``fleet/map``, has no owner; every writer may place its frames.
 
-Of edges that exclude each other (a second parent, a loop) the first ``EdgePrecedence`` is accepted, in
+If edges exclude each other (a second parent, a loop), the first by ``EdgePrecedence`` is accepted, in
 whatever order they arrive (``zstate.ingest.precedence``).
 """
 
@@ -670,7 +670,7 @@ class FrameOwnership:
         if there is None:
             return loop_refusal(parent, child, by, accepted.get)
         is_same_edge = there.parent == parent
-        # Of static edges the last value counts; samples of two writers would alternate. ROS allows that.
+        # The last value of static edges counts; samples of two writers would alternate. ROS allows that.
         both_move = there.order > 0 and there.pose is None and claim.pose is None
         is_own = there.source.is_of_writer_of(claim.source)
         there_rank = self._rank(there)

@@ -41,7 +41,7 @@ class EdgePrecedence(NamedTuple):
     is_departed: bool
     """The writer has left, or moves the edge without being announced."""
     is_replaced: bool
-    """Of those the one that is accepted now stays: it was the last to leave."""
+    """Another one took its place: the accepted one of the departed stays, as it was the last to leave."""
     is_static: bool
     order: int
     """The edge that was published first stays."""

@@ -18,10 +18,10 @@ from zstate.streams import StreamName
 from zstate.wire.messages import Sample
 
 MAX_STRANGERS = 256
-"""Writers of one robot that were never announced. Of more, the oldest is dropped with its edges."""
+"""Writers of one robot that were never announced. Beyond this number the oldest is dropped with its edges."""
 
 MAX_DEPARTED = 1024
-"""Writers of one robot that have left. Of more, the oldest is dropped with its edges."""
+"""Writers of one robot that have left. Beyond this number the oldest is dropped with its edges."""
 
 # An ingest takes 6 kB.
 _MAX_ALL_STRANGERS = 4096
@@ -71,7 +71,7 @@ class StreamIngests:
         self.is_shared = is_shared
         self.has_parts = has_parts
         self.capacity = 0
-        """Of the ring that the samples arrive in."""
+        """The capacity of the ring that the samples arrive in."""
         self.overflowed: set[StreamIngest] = set()
         """The ingests whose next gap is due to that ring."""
         self.newest_by_key: BoundedDict[str, StreamIngest] = BoundedDict()

@@ -11,7 +11,7 @@ from zstate.wire.messages import Edges, RobotDescription
 SILENT_NS = 2_000_000_000
 """A writer without a token that has sent nothing for this long no longer replaces an announced one."""
 
-# Of the last sessions; each may have 16 MB.
+# Descriptions of the last sessions are kept; each may have 16 MB.
 _MAX_DESCRIPTIONS = 4
 
 

@@ -33,7 +33,7 @@ _SHUTDOWN_POLL_S = 0.1
 # the response for so long.
 _REQUEST_WITHIN_S = 5.0
 _MAX_CONNECTIONS = 32
-"""Of more, the one that has waited longest without a whole request is closed."""
+"""Beyond this number, the one that has waited longest without a whole request is closed."""
 
 
 class BindAddress(NamedTuple):

@@ -109,7 +109,7 @@ class JointTransforms:
         return bool(self._floats)
 
     def has_unit_quaternions(self, positions: Floats) -> NDArray[np.bool_]:
-        """Of each row (N, nq): whether ``normalised`` accepts its quaternions."""
+        """Whether ``normalised`` accepts the quaternions of each row (N, nq)."""
         off = np.abs(self._norms(positions) - 1.0).max(axis=(1, 2), initial=0.0)
         return np.asarray(off) <= QUATERNION_TOLERANCE
 

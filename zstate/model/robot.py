@@ -71,7 +71,7 @@ class DeclaredLimits:
     velocity: float = np.inf
     effort: float = np.inf
     acceleration: float = np.inf
-    """Of commands alone: a joint of a URDF has none."""
+    """A limit of commands: a joint of a URDF has none."""
 
     def narrowed(self, other: DeclaredLimits) -> DeclaredLimits:
         """The narrower of these limits and ``other``, each."""

@@ -33,7 +33,7 @@ REFRESH_S = 30.0
 _UNANSWERED_REFRESH_S = 5.0
 
 _TIMEOUTS_S = (0.1, 0.2, 0.5)
-"""Of three attempts, the later two after those of other robots; then none until the offset is read again.
+"""Timeouts of three attempts, the later two after those of other robots; then none until the next read.
 
 Longer if the writer did not reply before.
 """
@@ -214,7 +214,7 @@ class _WriterOffset(Request):
         self._unanswered = 0
         self._requested_s = -math.inf
         self._is_measuring = False
-        # Of a measurement: when it began [s], when its last query was sent by both clocks, and what came.
+        # A measurement: when it began [s], when its last query was sent by both clocks, and what came.
         self._began_s = 0.0
         self._sent_ns = self._sent = 0
         self._reply: tuple[zenoh.Reply, int] | None = None

@@ -72,7 +72,7 @@ class EdgeMonitor(Closeable):
         self._joints = joints or {}
         self._streams = moving_streams() if joints else edge_streams()
         self._children: set[str] = set()
-        # Of writers, not of edges: a router's replies leave out some of the tokens that are subscribed.
+        # Those of writers, not of edges: a router's replies leave out some of the tokens that are subscribed.
         self._tokens: _Subscriber | None = None
         self._watched: dict[Announcement, _Watched] = {}
         self._next_check = 0.0

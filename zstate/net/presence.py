@@ -328,7 +328,7 @@ class WriterWatch(Receiver):
 
 
 class OtherTfSubscription(Closeable):
-    """The subscription to /tf of a listener of joint states, while a node writes it beside state publishers.
+    """A listener's subscription to /tf besides joint states, while others than state publishers write it.
 
     A state publisher writes there what its model and the joint states contain; zstate's own does not even
     compute it without a subscriber.

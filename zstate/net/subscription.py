@@ -67,17 +67,28 @@ def subscribe(
     ``name`` selects one writer of a stream whose writers have names.
 
     ``on_messages`` is called from one thread of the subscription with the messages of each batch, oldest
-    first; ``on_error(reason, text)`` and ``on_refused(key)`` for each payload that cannot be decoded;
-    ``on_withdrawn(key)`` if a latched value is withdrawn.
+    first; ``on_error(reason, text)`` and ``on_refused(key)`` for each payload that cannot be decoded, the
+    latter after the messages before it; ``on_withdrawn(key)`` if a latched value is withdrawn.
     """
     names = (robots,) if isinstance(robots, str) else robots
     robot = names[0] if len(names) == 1 else ANY
 
     def on_samples(samples: Sequence[SerializedSample]) -> None:
-        if messages := list(
-            decode_samples(wire, robot, stream, samples, on_error=on_error, on_refused=on_refused)
-        ):
-            on_messages(messages)
+        messages: list[Received] = []
+
+        def deliver() -> None:
+            if messages:
+                on_messages(messages.copy())
+                messages.clear()
+
+        def refuse(key: str) -> None:
+            if on_refused is not None:
+                deliver()
+                on_refused(key)
+
+        for message in decode_samples(wire, robot, stream, samples, on_error=on_error, on_refused=refuse):
+            messages.append(message)  # noqa: PERF402  # refuse empties the list meanwhile
+        deliver()
 
     def on_value(sample: SerializedSample) -> None:
         # ROS cannot withdraw values: an empty payload there is a broken message.

@@ -21,12 +21,13 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.clock import Clock, SystemClock
 from zstate.ingest.deadline import Deadline
+from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
 from zstate.plugins import is_bulk
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY
-from zstate.wire.messages import StampedMessage
+from zstate.wire.messages import StampedMessage, Status
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -207,6 +208,19 @@ class TopicStatistics(Closeable):
         self._arrived = threading.Condition()
         self._subscriptions = ExitStack()
         self._subscribers: list[StreamSubscriber] = []
+        self._stated_hz: BoundedDict[tuple[str, int], float] = BoundedDict()
+
+    def watch(self, streams: Iterable[StreamName], robot: str = ANY) -> None:
+        """Count ``streams``; of bulk data take the rates that writers state, so that nothing is received."""
+        for stream in streams:
+            if not is_bulk(stream):
+                self.subscribe(stream, robot)
+        self._subscriptions.enter_context(StatusSubscriber(self._session, robot, self._on_status))
+
+    def _on_status(self, robot: str, status: Status) -> None:
+        with self._arrived:
+            self._stated_hz[robot, status.session] = status.rate_hz
+            self._arrived.notify_all()
 
     def subscribe(self, stream: StreamName, robot: str = ANY) -> None:
         """Count ``stream`` of ``robot``, or of all robots, from now on."""
@@ -243,14 +257,23 @@ class TopicStatistics(Closeable):
         if self._on_sample is not None:
             self._on_sample(robot, stream, sample)
 
+    def published_hz(self, writer: WriterKey) -> float | None:
+        """The rate at which a writer publishes, of bulk data as it states it; None if it is not known."""
+        if is_bulk(writer.stream):
+            return self._stated_hz.get((writer.robot, writer.session))
+        counted = self.get(writer)
+        return None if counted is None else counted.published_hz()
+
     def get(self, source: Hashable) -> IntervalStatistics | None:
         """The statistics of one source; None if no sample has arrived."""
         return self._statistics.get(source)
 
-    def wait(self, sources: Collection[Hashable], timeout_s: float) -> None:
+    def wait(self, sources: Collection[WriterKey], timeout_s: float) -> None:
         """Wait until each source has 0.2 s of samples, enough for a rate, or for ``timeout_s``."""
 
-        def is_measurable(source: Hashable) -> bool:
+        def is_measurable(source: WriterKey) -> bool:
+            if is_bulk(source.stream):
+                return self.published_hz(source) is not None
             statistics = self.get(source)
             window = None if statistics is None else statistics.window()
             return window is not None and window.received[-1].at - window.received[0].at >= _MEASURABLE_NS

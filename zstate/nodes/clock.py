@@ -60,7 +60,7 @@ class SimulatedClock(Closeable):
     """The newest time received on ``zstate/clock``, or on ``/clock`` of a ROS wire.
 
     It stands still between messages, and may jump. The first call of ``now`` waits until a time is
-    received, for at most ``timeout_s``. Of several publishers the newest is followed; messages of the
+    received, for at most ``timeout_s``. The newest of several publishers is followed; messages of the
     others are counted in ``refused``. A forked process receives nothing: the clock is closed there. A context
     manager; safe from any thread.
     """

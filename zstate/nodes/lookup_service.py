@@ -26,7 +26,7 @@ class LookupService(Queryable):
 
     Without ``at`` [ns] the newest instant is used. Ambiguous bare frame names are those of ``robot``.
     ``buffer`` is the buffer, for instance ``listener.buffer``, or a function that returns it at each query.
-    A failed lookup is answered with an error, in JSON as well. A context manager.
+    The reply to a failed lookup is an error, in JSON as well. A context manager.
     """
 
     def __init__(

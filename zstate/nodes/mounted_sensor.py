@@ -63,7 +63,7 @@ class MountedSensor:
         if stamp < self._last - _RESTART_NS:
             self._last = -1
         try:
-            end = min(stamp, self._newest(target, stamp))
+            end = min(stamp, self._newest(target, self._frame, stamp))
             first = end - int(offsets[-1])
             if end <= self._last or first < 0:
                 return None
@@ -75,10 +75,11 @@ class MountedSensor:
         self._last = end
         return SweepPoses(first, poses)
 
-    def _newest(self, target: str, stamp: int) -> int:
+    def _newest(self, target: str, source: str, stamp: int) -> int:
+        """The newest stamp at which ``source`` is placed in ``target``; ``stamp`` if all edges are static."""
         try:
-            return self._buffer.latest(target, self._frame)
+            return self._buffer.latest(target, source)
         except NoData:
-            if self._buffer.can_lookup(target, self._frame):  # all edges are static
+            if self._buffer.can_lookup(target, source):
                 return stamp
             raise

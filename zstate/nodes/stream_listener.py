@@ -38,10 +38,10 @@ class ReceivedMessage(NamedTuple):
 class StreamListener(Closeable):
     """Receives the messages of ``stream``, a row or its name, of a robot, of several, or of all with ``"*"``.
 
-    ``for received in listener`` and ``async for received in listener`` return each message once, in the
-    order of arrival, and end with ``close()``; ``get`` returns the next one. Of more than 4096 unread
-    messages, 8 of bulk data, the oldest are lost, and counted in ``lost``. ``refused`` counts payloads that
-    are no message of the stream, by reason; the first of each reason is also logged. A context manager.
+    ``for received in listener`` and ``async for received in listener`` return each message once, in the order
+    of arrival, and end with ``close()``; ``get`` returns the next one. If more than 4096 messages are unread,
+    8 of bulk data, the oldest are lost, and counted in ``lost``. ``refused`` counts payloads that are no
+    message of the stream, by reason; the first of each reason is also logged. A context manager.
 
     Raises InvalidInput for a stream that no installed package brings, or that ``wire`` does not carry.
     """

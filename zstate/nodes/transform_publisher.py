@@ -40,7 +40,7 @@ class EdgePublisher(SamplePublisher):
 
     _stream: ClassVar[StreamName]
     _numbers: ClassVar[int]
-    """Of a sample, for which the cache has room for 2000."""
+    """How many numbers a sample has; the cache has room for 2000 samples."""
 
     def __init__(
         self,

@@ -32,7 +32,7 @@ _REST_RATE, _REST_FORCE = 0.1, 0.4
 _NO_FORCE = 0.1
 """[m/s^2] What an accelerometer reads without any signal is less."""
 _FORCE_PART = 0.5
-"""Of gravity: the mean of a robot that drives differs by less."""
+"""A part of gravity: the mean of a robot that drives differs by less."""
 
 # Standard deviations of the first state, in the order of the filter: rad, m/s, m, rad/s, m/s^2.
 _YAW, _POSITION = 1e-4, 1e-4
@@ -40,7 +40,7 @@ _TILT, _COARSE_TILT = 0.02, 0.2
 _SPEED = 2.0
 _GYRO_BIAS, _UNKNOWN_GYRO_BIAS, _ACCEL_BIAS = 0.01, 0.02, 0.05
 _TURN = 0.3
-"""Of a turn by wheels, as a part of it: they may slip, or skid."""
+"""The standard deviation of a turn by wheels, as a part of it: they may slip, or skid."""
 
 
 class Alignment(NamedTuple):

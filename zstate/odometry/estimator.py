@@ -164,12 +164,12 @@ class BaseEstimator:
     ``odom`` is the frame in which the base starts, at the origin with the yaw zero and z up, after about 0.5
     s at rest; with an ``initial_pose``, odom_from_base, at the first event. Mounts of sensors are looked up
     in ``buffer`` and must be static; names are bare or with the robot, as there. ``imu_noise`` is that of the
-    IMU. Events older than ``history_s`` before the newest one are refused and counted. ``wheels`` are those
-    that ``joints`` reads.
+    IMU. Events older than ``history_s`` before the newest one are refused and counted. ``wheels`` and
+    ``legs`` are those that ``joints`` reads.
 
     Events may arrive in any order; an event that comes twice counts once. A reading more than ``history_s``,
     and more than a second, after the newest one is used once a second one confirms it. If time goes back by
-    as much for half a second of readings, as in a recording in a loop, it starts anew, and ``epoch``, the
+    as much for half a second of readings, as in a recording in a loop, it restarts, and ``epoch``, the
     number of such starts and of calls of ``reset``, grows (``zstate.odometry.stamp_order``).
 
     Not safe for several threads at once. Raises InvalidInput for a sensor that moves on the base,
@@ -209,7 +209,7 @@ class BaseEstimator:
             self._mount(wheels.frame)
         self._initial_pose = initial_pose
         self.epoch = 0
-        """How often it has started anew: by ``reset``, or because time went back."""
+        """How often it has restarted: by ``reset``, or because time went back."""
         self.placements = 0
         """How often it was placed by ``set_pose``."""
         self._begin()
@@ -231,10 +231,10 @@ class BaseEstimator:
         self._sources: dict[str, SourceRecord] = {}
         self._follower = None
         self._restarts: dict[str, tuple[int, str]] = {}
-        """By source, when and why it made the estimate start anew."""
+        """By source, when and why it restarted the estimate."""
 
     def reset(self, odom_from_base: Transform | None = None) -> None:
-        """Start anew: forget all events, biases and the pose, and align again, at rest.
+        """Restart: forget all events, biases and the pose, and align again, at rest.
 
         The base is then at the origin of ``odom``, or at ``odom_from_base`` from the next event on, as with
         ``initial_pose``, whose place it takes. It is no correction: in the terms of REP 105 the pose in
@@ -273,10 +273,10 @@ class BaseEstimator:
         frame: str,
         gate: float = GATE_PROBABILITY,
     ) -> None:
-        """The position of the origin of ``frame`` in ``odom`` at ``stamp`` [m], (3,), as of an antenna.
+        """The ``position`` of the origin of ``frame`` in ``odom`` at ``stamp`` [m], (3,), as of an antenna.
 
-        ``covariance`` (3, 3) is that of errors that are independent of those of other readings. ``gate`` is
-        as in ``velocity``. Raises InvalidInput and UnknownFrame as ``pose``.
+        ``covariance`` (3, 3) is that of errors that are independent of those of other readings. ``source``
+        and ``gate`` are as in ``velocity``. Raises InvalidInput and UnknownFrame as ``pose``.
         """
         measured = checked_vector(position, source, "position", MAX_DISTANCE)
         noise = checked_noise(None, covariance, 3, source)
@@ -335,14 +335,15 @@ class BaseEstimator:
         axes: Sequence[str] = VELOCITY_AXES,
         gate: float = GATE_PROBABILITY,
     ) -> None:
-        """The velocity of the origin of ``frame`` in its own axes at ``stamp``, x y z [m/s], (3,).
+        """The ``linear`` velocity of the origin of ``frame`` in its own axes at ``stamp``, x y z [m/s], (3,).
 
-        Its noise is given by ``sigma``, standard deviations (3,), or by ``covariance``, (3, 3). ``frame`` is
-        the base by default. ``angular`` [rad/s] (3,) is used while the IMU is silent, and to know standstill.
-        ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels. ``axes``
-        are those that are measured, and ``gate`` the part of readings that pass if all sigmas are right.
-        Raises InvalidInput, which names the source, for NaN, for what is no covariance, for more than
-        1e4 m/s or 1e3 rad/s, and for standard deviations outside of 1e-9 to 1e9; UnknownFrame for the frame.
+        ``source`` is the name of the sensor, under which ``health`` lists it. Its noise is given by
+        ``sigma``, standard deviations (3,), or by ``covariance``, (3, 3). ``frame`` is the base by default.
+        ``angular`` [rad/s] (3,) is used while the IMU is silent, and to know standstill. ``scale`` is the
+        standard deviation of a constant relative error, as of a radius of wheels. ``axes`` are those that are
+        measured, and ``gate`` the part of readings that pass if all sigmas are right. Raises InvalidInput,
+        which names the source, for NaN, for what is no covariance, for more than 1e4 m/s or 1e3 rad/s, and
+        for standard deviations outside of 1e-9 to 1e9; UnknownFrame for the frame.
         """
         vector = checked_vector(linear, source, "velocity", MAX_SPEED)
         rate = None if angular is None else checked_vector(angular, source, "angular velocity", MAX_RATE)
@@ -439,10 +440,11 @@ class BaseEstimator:
     ) -> None:
         """The pose of a frame on the robot in ``odom`` at ``stamp``, as of motion capture.
 
-        ``covariance`` (6, 6) has the order and axes of ``Transform.covariance``, and ``axes`` are those of
-        them that are measured; ``gate`` is as in ``velocity``. Raises InvalidInput, which names the source,
-        for another target than ``odom``, NaN, what is no covariance, more than 1e8 m, and standard deviations
-        outside of 1e-9 to 1e9; UnknownFrame for the frame.
+        ``odom_from_base`` is that pose, whose source is the base or another frame on it. ``covariance``
+        (6, 6) has the order and axes of ``Transform.covariance``, and ``axes`` are those of them that are
+        measured; ``gate`` is as in ``velocity``. Raises InvalidInput, which names the source, for another
+        target than ``odom``, NaN, what is no covariance, more than 1e8 m, and standard deviations outside of
+        1e-9 to 1e9; UnknownFrame for the frame.
         """
         if odom_from_base.target != self.odom:
             raise InvalidInput(
@@ -472,11 +474,11 @@ class BaseEstimator:
     ) -> None:
         """A pose of another odometry at ``stamp``, as of visual or lidar odometry, in a world of its own.
 
-        The displacement since its last one is used, with a constant scale, which is estimated. Its target is
-        any frame, its source one on the robot. ``covariance`` (6, 6), of ``Transform.covariance``, is used as
-        ``noise`` says (by default not), but for one that is none, such as zeros. A displacement that the
-        other sources contradict is rejected, and so a jump does no harm. Raises InvalidInput, which names the
-        source, for NaN and more than 1e8 m; UnknownFrame for the frame.
+        The displacement since its last one is used, with a constant scale, which is estimated. The target of
+        ``world_from_frame`` is any frame, its source one on the robot. ``covariance`` (6, 6), of
+        ``Transform.covariance``, is used as ``noise`` says (by default not), but for one that is none, such
+        as zeros. A displacement that the other sources contradict is rejected, and so a jump does no harm.
+        Raises InvalidInput, which names the source, for NaN and more than 1e8 m; UnknownFrame for the frame.
         """
         checked_vector(world_from_frame.translation, source, "position", MAX_DISTANCE)
         mount, matrix = self._mount(world_from_frame.source), world_from_frame.matrix
@@ -563,14 +565,15 @@ class BaseEstimator:
         expected: EarthField | None = None,
         gate: float = GATE_PROBABILITY,
     ) -> None:
-        """The magnetic field in the axes of ``frame`` at ``stamp``, x y z [T], (3,), of which a yaw is known.
+        """The magnetic ``field`` in the axes of ``frame`` at ``stamp``, x y z [T], (3,), which gives a yaw.
 
-        ``frame`` is the base by default. ``sigma`` [rad] is that of the yaw, which is levelled by the
-        attitude at that stamp, and is used as that of a ``heading``. A field is rejected, with a sentence in
-        ``health``, if its strength differs by more than 10 %, or its dip by more than 5 degrees, from the
-        mean of ten readings in a row at the start, or from the field of the Earth that is ``expected``.
-        Raises InvalidInput, which names the source, for NaN, for less than 1e-6 or more than 1e-3 T, and for
-        a sigma outside of 1e-9 to 1e9.
+        ``frame`` is the base by default. ``source`` is the name of the sensor in ``health``, ``gate`` is as
+        in ``velocity``. ``sigma`` [rad] is that of the yaw, which is levelled by the attitude at that stamp,
+        and is used as that of a ``heading``. A field is rejected, with a sentence in ``health``, if its
+        strength differs by more than 10 %, or its dip by more than 5 degrees, from the mean of ten readings
+        in a row at the start, or from the field of the Earth that is ``expected``. Raises InvalidInput, which
+        names the source, for NaN, for less than 1e-6 or more than 1e-3 T, and for a sigma outside of 1e-9 to
+        1e9.
         """
         vector = checked_vector(field, source, "magnetic field", MAX_FIELD)
         check_strength(math.sqrt(vector @ vector), source)
@@ -746,7 +749,7 @@ class BaseEstimator:
         self._begin()
         self._order = order
         self.epoch += 1
-        text = f"time went back by {format_duration(size_ns)}; the odometry started anew"
+        text = f"time went back by {format_duration(size_ns)}; the odometry restarted"
         self._record(source)
         self._restarts = {source: (order.newest or 0, text)}
 

@@ -31,9 +31,9 @@ from zstate.odometry.source_noise import FixNoise
 
 _MOST_KEPT = 1000
 _KEPT_APART = 1.0 / 200.0
-"""Of the time over which fixes are compared, those that are kept are apart by this part."""
+"""Fixes that are kept are apart by this part of the time over which they are compared."""
 _WAY = 0.02
-"""Of the length of a way by wheels, its error is about this part: ``VelocityNoise.scale``."""
+"""The error of a way by wheels is about this part of its length: ``VelocityNoise.scale``."""
 _WANDER_S = (25.0, 40.0)
 """Over such a time, fixes that are honest do not leave the way by more than the gate."""
 _UNPROVEN = 4.0
@@ -41,7 +41,7 @@ _UNPROVEN = 4.0
 _EXCESS_S, _MOST_EXCESS, _LEAST_EXCESS = 60.0, 25.0, 1.0
 """It is averaged for so long, and has these limits."""
 _BELIEVED_WAY, _BELIEVED_COUNT, _BELIEVED_GATE = 20.0, 10, 0.95
-"""Of fixes that were refused: [m], how many they are at least, and how well they agree. By a wider gate, and
+"""The way of fixes that were refused [m], their least number, and how well they agree. By a wider gate, and
 in less time, a drift of 0.5 m/s would agree with a way whose yaw is uncertain."""
 
 
@@ -139,7 +139,7 @@ class FixReceiver:
     lever: Floats
     noise: FixNoise
     stamps: deque[int] = field(default_factory=lambda: deque[int](maxlen=WINDOW))
-    """Of the last fixes, in the order of arrival."""
+    """The stamps of the last fixes, in the order of arrival."""
     waiting: list[PlaneFix] = field(default_factory=list[PlaneFix])
     """Newer than the odometry, by stamp."""
     last: PassedFix | None = None
@@ -237,7 +237,7 @@ class FixReceiver:
         return ""
 
     def _share(self, last: PassedFix, passed: PassedFix) -> float:
-        """Of the variance of a difference: errors of neighbours are alike."""
+        """The part of the variance of a difference: errors of neighbours are alike."""
         elapsed_s = (passed.fix.stamp - last.fix.stamp) * 1e-9
         return 0.5 if elapsed_s < self.noise.correlated_s else 1.0
 

@@ -21,8 +21,8 @@ kept.
 - A height by a barometer is relative to the first one of its source as well, and its error wanders with the
   weather. The height is never known better than by what the barometer may have wandered since its first
   reading, and moves alone: velocity, tilt and biases learn nothing from it. A barometer that is rejected for
-  two seconds, as in a gust, begins anew.
-- Of another odometry the displacements between its poses are used, with a constant scale, which velocities
+  two seconds, as in a gust, begins again.
+- The displacements between the poses of another odometry are used, with a constant scale, which velocities
   and positions of other sources show. A jump is rejected, and the way goes on from there.
 - A magnetic field is a heading, that of the axis along the field. Iron and motors change its strength or its
   dip as well: a field that differs from the one at the start, or from the Earth's, is rejected.
@@ -131,7 +131,7 @@ _TILT_BOUND, _YAW_BOUND = 0.3, math.pi
 """[rad] Standard deviations after a pause: a base does not fall over."""
 _PAUSE_NS = 500_000_000
 _PAUSE_SLIP, _PAUSE_PLACE, _PAUSE_YAW, _PAUSE_TILT = 0.3, 0.02, 0.02, 0.02
-"""Of a displacement by wheels over a pause: a part of it, [m], [rad] and [rad]."""
+"""Standard deviations of a displacement by wheels over a pause: a part of it, [m], [rad] and [rad]."""
 
 _TILT_RATE = 0.05
 """[rad/s] The tilt of the continuous pose follows that of the estimate so fast."""
@@ -160,7 +160,7 @@ _LEVEL = slice(POSITION.start, POSITION.start + 2)
 _UP = POSITION.start + 2
 
 COASTING_RATE_DENSITY, _COASTING_FORCE_DENSITY = 0.1, 1.0
-"""Of the rate by wheels [rad/s/sqrt(Hz)], and of unknown accelerations [m/s^2/sqrt(Hz)]."""
+"""Noise densities of the rate by wheels [rad/s/sqrt(Hz)] and of unknown accelerations [m/s^2/sqrt(Hz)]."""
 _COASTING_WHEELS_NS = 100_000_000
 """The rate of the wheels is used for so long."""
 _UNKNOWN_RATE = 0.5
@@ -295,7 +295,7 @@ class Compass(NamedTuple):
 
 
 class Altimeter(NamedTuple):
-    """Of a source of heights, the stamp of its first reading, and what it was more than our height then.
+    """The stamp of the first reading of a source of heights, and how much it was above the estimate then.
 
     ``variance`` is that of this difference: of the reading, and of our height.
     """
@@ -670,7 +670,7 @@ class Fusion:
         is_driven = wheels_at is not None and reading.stamp - wheels_at <= _WHEELS_VALID_NS
         is_confirmed = is_driven and not estimate.runs.keys() - {source}
         measurement = tracking(state, source, move.spread, mount)
-        # Of the frame: the second half of the residual is the shift of the world's origin.
+        # The second half of the residual is of the frame: the shift of the world's origin.
         tracked = next(one for one in state.tracked if one.source == source)
         there, lever = tracked.position, (tracked.rotation - state.rotation).dot(mount[:3, 3])
         apart, angle = there - state.position + lever, math.hypot(*measurement.residual[:3].tolist())
@@ -1340,7 +1340,7 @@ def _with_rejection(estimate: Estimate, source: str) -> tuple[Estimate, bool]:
 
 
 def _with_altimeter(estimate: Estimate, source: str, altimeter: Altimeter) -> Estimate:
-    """The estimate with a source of heights that begins, or begins anew."""
+    """The estimate with a source of heights that begins, or begins again."""
     estimate = _with_run(estimate, source, None)
     return estimate._replace(altimeters={**estimate.altimeters, source: altimeter})
 

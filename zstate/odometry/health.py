@@ -53,7 +53,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SourceHealth:
-    """The state of one source.
+    """The state of one source, by its ``name``.
 
     ``rate_hz`` is that of the newest readings, ``age_s`` how much older than the newest data of all sources
     its newest one is. ``nis_mean`` is the mean NIS of the last readings of ``dimension`` numbers, NaN without
@@ -83,9 +83,9 @@ class SourceRecord:
     stamps: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
     """In the order of arrival."""
     outcomes: deque[Outcome] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    """Of readings that are too old to be replayed; oldest first."""
+    """Outcomes of readings that are too old to be replayed; oldest first."""
     fates: Counter[Fate] = field(default_factory=Counter[Fate])
-    """Of the same readings, all of them."""
+    """Counts of all of these readings."""
     too_late: int = 0
     late_ns: int = 0
     """How much too old the newest of these was, against the newest reading of all sources."""

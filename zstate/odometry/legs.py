@@ -133,9 +133,9 @@ class Stance(NamedTuple):
 class Legs:
     """The feet of ``model``, links whose origins touch the ground, seen from the link ``imu``.
 
-    ``detection`` decides which feet touch if contacts are not measured (``touching``). Not for several
-    threads at once. Raises InvalidInput for unknown links, with near misses, and for feet that no joint
-    moves.
+    ``noise`` is that of the places of the feet. ``detection`` decides which feet touch if contacts are not
+    measured (``touching``). Not for several threads at once. Raises InvalidInput for unknown links, with near
+    misses, and for feet that no joint moves.
     """
 
     def __init__(
@@ -198,12 +198,12 @@ class Legs:
         velocities: Mapping[str, float] | None = None,
         efforts: Mapping[str, float] | None = None,
     ) -> frozenset[str]:
-        """The feet on the ground by ``detection``; ``before`` are those that touched until now.
+        """Those of ``feet`` on the ground by ``detection``; ``before`` are those that touched until now.
 
         By force: that which balances the ``efforts`` of the joints [Nm] or [N], ``J^T f = -tau``, without the
-        weight of the leg. By speed: that of ``R^T v + omega x r + J q'``, with the state's velocity, the rate
-        of the ``gyro`` less its bias, the foot's offset r and the joints' ``velocities`` q' [rad/s] or [m/s].
-        Raises InvalidInput for numbers that are missing.
+        weight of the leg. By speed: that of ``R^T v + omega x r + J q'``, with the ``state``'s velocity, the
+        rate of the ``gyro`` less its bias, the foot's offset r and the joints' ``velocities`` q' [rad/s] or
+        [m/s]. Raises InvalidInput for numbers that are missing.
         """
         if self.detection is None:
             raise InvalidInput(

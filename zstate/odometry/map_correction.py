@@ -55,8 +55,8 @@ class MapCorrection(Closeable):
     ``robot`` owns bare frame names; ``map`` may be a full name such as "fleet/map". The odometry comes from
     ``buffer``, which a listener of this robot fills, or from a listener of its own on the first of ``wires``.
     If the odometry is restarted, its frame has another origin: nothing is published until the next ``set``,
-    and the writer's status is a warning. Other parameters and SecondWriter as of ``TransformPublisher``. A
-    context manager; safe from any thread.
+    and the writer's status is a warning. ``writer``, ``wires``, ``clock``, ``program`` and SecondWriter are
+    as of ``TransformPublisher``. A context manager; safe from any thread.
     """
 
     def __init__(

@@ -106,7 +106,8 @@ class MapEstimator:
         """The position of an antenna, the origin of ``frame``, at ``stamp`` [ns].
 
         ``latitude`` and ``longitude`` [deg] and ``altitude`` [m], None if it is not known, are those of
-        WGS84. ``covariance`` (3, 3) [m^2] is that of east, north, up. ``noise`` takes precedence over it.
+        WGS84. ``source`` is the name of the receiver in ``health``. ``covariance`` (3, 3) [m^2] is that of
+        east, north, up. ``noise`` takes precedence over it.
         Fixes may come late, as the events of the odometry. One that is newer than they are is used by the
         first call of any method after the odometry has come up to it, which must not be ``history_s`` later.
         Raises InvalidInput, which names the source, for what is no place on the Earth, for (0, 0), which
@@ -218,7 +219,7 @@ class MapEstimator:
         return found
 
     def _variances(self, source: str, covariance: ArrayLike | None, noise: FixNoise) -> Floats:
-        """Of x, y and z [m^2], (3,)."""
+        """The variances of x, y and z [m^2], (3,)."""
         if noise.sigmas is not None:
             across, up = noise.sigmas
         else:

@@ -151,7 +151,7 @@ def _failure(error: Exception, place: str) -> tuple[str, str]:
 
 
 class _MapPublishers(NamedTuple):
-    """Of map -> odom, of the pose of the base in the map, and of its datum."""
+    """Publishers of map -> odom, of the pose of the base in the map, and of its datum."""
 
     edge: TransformPublisher
     pose: PosePublisher
@@ -184,6 +184,8 @@ def _check_sensors(sensors: Sequence[Sensor], wire: str, writer: str, *, has_map
 
 class OdometryNode(Closeable):
     """Feeds ``base`` with the sensors of ``robot``, and publishes its odometry as ``writer``.
+
+    ``program`` is the writer's name for others, by default the script's name.
 
     ``base`` gets the readings of the IMU ``imu`` and of the further ``sensors``, each by its name and with
     what is stated of its noise, whose class tells the kind: ``[("wheels", VelocityNoise(sigma=0.05))]``; and
@@ -278,7 +280,7 @@ class OdometryNode(Closeable):
             self._opened = opening.pop_all()
 
     def _restart(self) -> None:
-        """Publish from the next stamp on, whatever it is; the estimator has started anew."""
+        """Publish from the next stamp on, whatever it is; the estimator has restarted."""
         self._imu_stamp = self._due = self._newest = self._assessed = _LONG_AGO
         self._epoch = self.base.epoch
         self._logged: dict[str, int] = {}
@@ -315,7 +317,7 @@ class OdometryNode(Closeable):
         return in_plane(state) if self._is_planar else state
 
     def reset(self, odom_from_base: Transform | None = None) -> None:
-        """Start anew, as ``BaseEstimator.reset``."""
+        """Restart, as ``BaseEstimator.reset``."""
         with self._lock:
             self.base.reset(odom_from_base)
 

@@ -60,13 +60,17 @@ class ImuPublisher(_SensorPublisher):
     """Publishes the readings of one inertial measurement unit of a robot.
 
     ``sensor`` is its name, in ROS its topic; by default that of the stream. Its axes are those of ``frame``,
-    by default a frame of the sensor's name; a bare name is the robot's own. The covariances of its numbers,
-    (3, 3), are published with each reading if they are given.
+    by default a frame of the sensor's name; a bare name is the robot's own. ``gyro_covariance``
+    [rad^2/s^2] and ``accel_covariance`` [m^2/s^4], (3, 3), are published with each reading if they are given.
+
+    ``wires`` are what it publishes on, "native" (the default), "ros2" with options, or several. ``clock``
+    gives the stamps of readings without one; default: the system's. ``program`` is the writer's name for
+    others; default: the script's name.
 
     Under congestion readings are dropped, and joining listeners receive none from the past. On the native
     wire each sensor has one writer: SecondWriter, which names the first one, is raised if another writer
-    publishes it, or by ``publish`` if both opened at once, which closes the later one. ``program`` is the
-    script's name by default. A context manager; safe from any thread.
+    publishes it, or by ``publish`` if both opened at once, which closes the later one. A context manager;
+    safe from any thread.
     """
 
     _stream = "imu"
@@ -102,9 +106,9 @@ class ImuPublisher(_SensorPublisher):
         """Publish one reading at ``stamp`` [ns]; default: now.
 
         ``gyro`` [rad/s] and ``accel`` [m/s^2], specific force, are x y z. ``orientation`` is the quaternion
-        x y z w of the frame in axes that the device defines, with a covariance [rad^2], (3, 3), if that is
-        known. Raises InvalidInput for numbers that are not finite, for other shapes and for a quaternion
-        whose length is not 1; SecondWriter; and Closed. If it raises, nothing was sent.
+        x y z w of the frame in axes that the device defines; ``orientation_covariance`` [rad^2], (3, 3), is
+        given if it is known. Raises InvalidInput for numbers that are not finite, for other shapes and for a
+        quaternion whose length is not 1; SecondWriter; and Closed. If it raises, nothing was sent.
         """
         with self._refusals:
             stamp = self._clock.now() if stamp is None else check_stamp(stamp)
@@ -117,8 +121,8 @@ class ImuPublisher(_SensorPublisher):
 class VelocityPublisher(_SensorPublisher):
     """Publishes the velocities that one sensor of a robot measures: optical flow, a Doppler log, a leg.
 
-    A velocity is that of ``frame`` relative to the world, in its own axes. Sensors, frames, writers and
-    threads are those of ``ImuPublisher``.
+    A velocity is that of ``frame`` relative to the world, in its own axes. ``robot``, ``sensor``,
+    ``wires``, ``frame``, ``clock`` and ``program``, writers and threads are those of ``ImuPublisher``.
     """
 
     _stream = "velocity"
@@ -149,8 +153,8 @@ class PosePublisher(MeasurementPublisher):
     """Publishes the poses that one sensor of a robot measures: motion capture, a marker, a scan matcher.
 
     They are measurements, no edges: no lookup uses them. In ROS the message names the parent alone, and
-    readers take the child for the base of the robot. Sensors, writers and threads are those of
-    ``ImuPublisher``.
+    readers take the child for the base of the robot. ``robot``, ``sensor``, ``wires``, ``clock`` and
+    ``program``, writers and threads are those of ``ImuPublisher``.
     """
 
     def __init__(
@@ -186,8 +190,8 @@ class PosePublisher(MeasurementPublisher):
 class FixPublisher(_SensorPublisher):
     """Publishes the positions of one satellite receiver (GPS, GNSS) of a robot on the Earth.
 
-    A position is that of the antenna, the origin of ``frame``. Sensors, frames, writers and threads are those
-    of ``ImuPublisher``.
+    A position is that of the antenna, the origin of ``frame``. ``robot``, ``sensor``, ``wires``, ``frame``,
+    ``clock`` and ``program``, writers and threads are those of ``ImuPublisher``.
     """
 
     _stream = "fix"
@@ -230,7 +234,8 @@ class FixPublisher(_SensorPublisher):
 class PressurePublisher(_SensorPublisher):
     """Publishes the readings of one barometer of a robot.
 
-    Sensors, frames, writers and threads are those of ``ImuPublisher``.
+    ``robot``, ``sensor``, ``wires``, ``frame``, ``clock`` and ``program``, writers and threads are those of
+    ``ImuPublisher``.
     """
 
     _stream = "pressure"
@@ -252,7 +257,8 @@ class DatumPublisher(ValuePublisher):
     """Publishes where on the Earth the origin of a map is, latched: readers that join later receive it too.
 
     ``frame`` is the map, whose x is east, y north and z up; a bare name is the robot's own. ``writer``
-    distinguishes maps of one robot. ``close()`` withdraws it. SecondWriter is raised as by ``MapPublisher``.
+    distinguishes maps of one robot. ``program`` is the writer's name for others, by default the script's
+    name. ``close()`` withdraws it. SecondWriter is raised as by ``MapPublisher``.
     ROS has no message for it. A context manager.
     """
 
@@ -282,8 +288,8 @@ class DatumPublisher(ValuePublisher):
 class MagneticFieldPublisher(_SensorPublisher):
     """Publishes the magnetic fields that one magnetometer of a robot measures, in the axes of ``frame``.
 
-    ``covariance`` [T^2], (3, 3), is published with each of them if it is given. Sensors, frames, writers and
-    threads are those of ``ImuPublisher``.
+    ``covariance`` [T^2], (3, 3), is published with each of them if it is given. ``robot``, ``sensor``,
+    ``wires``, ``frame``, ``clock`` and ``program``, writers and threads are those of ``ImuPublisher``.
     """
 
     _stream = "magnetic_field"
@@ -318,9 +324,10 @@ class MagneticFieldPublisher(_SensorPublisher):
 class OdometryPublisher(EdgePublisher):
     """Publishes where the base of a robot is, and how fast it moves: the edge odom -> base_link and a twist.
 
-    Listeners take it as a moving edge. Frames, writers, history and threads are those of
-    ``TransformPublisher``: on the native wire each edge has one writer, of transforms or of odometry. On the
-    ROS wires it is a nav_msgs/Odometry on a topic of the name ``writer``, and the edge on /tf.
+    Listeners take it as a moving edge. ``robot``, ``wires``, ``clock``, ``program`` and ``cache_s``, frames,
+    writers and threads are those of ``TransformPublisher``: on the native wire each edge has one writer, of
+    transforms or of odometry. On the ROS wires it is a nav_msgs/Odometry on a topic of the name ``writer``,
+    and the edge on /tf.
     """
 
     _stream = "odometry"
@@ -350,9 +357,10 @@ class OdometryPublisher(EdgePublisher):
     ) -> None:
         """Publish the pose of the base, with its covariance if known, and its velocity at ``stamp`` [ns].
 
-        The default stamp is that of the transform, or now if it has none. ``linear`` [m/s], the velocity of
-        the base's origin relative to the odometry frame, and ``angular`` [rad/s] are x y z in the axes of the
-        base; ``twist_covariance`` is (6, 6) of both. Raises as ``TransformPublisher.publish``.
+        ``odom_from_base`` is the pose; its frames are those of the edge. The default stamp is that of the
+        transform, or now if it has none. ``linear`` [m/s], the velocity of the base's origin relative to the
+        odometry frame, and ``angular`` [rad/s] are x y z in the axes of the base; ``twist_covariance`` is
+        (6, 6) of both. Raises as ``TransformPublisher.publish``.
         """
         with self._refusals:
             if stamp is None:

@@ -20,7 +20,7 @@ from zstate.odometry.rotations import skew
 from zstate.odometry.source_noise import RelativeNoise
 
 _TURNED = 0.02
-"""Of a turn [rad]: the standard deviation of any source, by this part."""
+"""The standard deviation of a turn of any source, as a part of the turn."""
 
 _NEGATIVE = -1e-9
 """Eigenvalues below this part of the largest one are negative, and not by rounding."""

@@ -1,4 +1,4 @@
-"""Requests to a running odometry node: to start anew, or to place the base.
+"""Requests to a running odometry node: to restart, or to place the base.
 
 A request is a query of ``zstate/<robot>/@odometry/<writer>`` with the parameter ``do``: ``reset`` or
 ``set_pose``. ``pose``, which ``set_pose`` needs, is odom_from_base: x y z [m] and qx qy qz qw, separated by
@@ -35,8 +35,9 @@ def request_odometry(
 ) -> None:
     """Have the odometry of ``robot``, as ``writer``, reset or placed, as the methods of ``BaseEstimator``.
 
-    The frames of the pose are those of the node, whatever the transform calls them. Raises InvalidInput with
-    the reason if the node refuses, and Unreachable without a reply within ``timeout_s`` [s].
+    ``action`` is "reset" or "set_pose"; the latter needs ``odom_from_base``, the pose from now on. Its frames
+    are those of the node, whatever the transform calls them. Raises InvalidInput with the reason if the node
+    refuses, and Unreachable without a reply within ``timeout_s`` [s].
     """
     check_timeout(timeout_s)
     key = ODOMETRY_REQUEST.key(robot, writer)

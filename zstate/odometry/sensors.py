@@ -257,7 +257,7 @@ def heading_covariance(sensor: str, noise: HeadingNoise, message: Imu) -> Floats
 
 
 def add_heading(estimators: Estimators, sensor: str, noise: HeadingNoise, message: Imu) -> None:
-    """Pass the yaw of the orientation of an IMU to the odometry, as a source of its own beside its rates."""
+    """Pass the yaw of the orientation of an IMU to the odometry, as a source apart from its rates."""
     sigma = math.sqrt(float(heading_covariance(sensor, noise, message)[0, 0]))
     assert message.orientation is not None
     x, y, z, w = from_block(message.orientation).tolist()

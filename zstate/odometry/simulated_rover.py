@@ -28,7 +28,7 @@ from zstate.sources.square_drive import SquareDriveState, WheelPair
 from zstate.transform import Transform
 
 WheelRates: TypeAlias = tuple[float, float]
-"""Of the left and the right wheel [rad/s]."""
+"""The rates of the left and the right wheel [rad/s]."""
 
 _STEP_NS = 1_000_000
 _STEP_S = 1e-9 * _STEP_NS
@@ -70,10 +70,11 @@ class ImuReading(NamedTuple):
 class SimulatedRover:
     """A base on two driven wheels, which starts at the identity, at rest, at the first ``advance``.
 
-    ``base_from_imu`` is the mount of the IMU on the base, whose origin is below the middle of the axle.
-    ``slip`` is the standard deviation of the slip of each wheel; ``noise`` that of the IMU, whose biases
-    start at ``gyro_bias`` [rad/s] and ``accel_bias`` [m/s^2]. A function of ``seed``, of the setpoints and of
-    the stamps alone. Raises InvalidInput for a negative slip. Safe from any thread.
+    ``wheels`` are their radius and their distance. ``base_from_imu`` is the mount of the IMU on the base,
+    whose origin is below the middle of the axle. ``slip`` is the standard deviation of the slip of each
+    wheel; ``noise`` that of the IMU, whose biases start at ``gyro_bias`` [rad/s] and ``accel_bias`` [m/s^2].
+    A function of ``seed``, of the setpoints and of the stamps alone. Raises InvalidInput for a negative slip.
+    Safe from any thread.
     """
 
     def __init__(

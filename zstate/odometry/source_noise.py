@@ -28,17 +28,14 @@ CovarianceKind: TypeAlias = Literal["stated", "dependent", "independent"]
 """What covariances of poses of another odometry are: of no use, of dead reckoning, or of each pose alone."""
 
 HEIGHT_FACTOR = 10.0
-"""Of a height by satellites, all of which are above: it is less sure than the position."""
+"""How much less sure a height by satellites is than the position: all of them are above."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceNoise:
-    """What may be stated of any source.
+    """What may be stated of any source; ``VelocityNoise`` describes it.
 
-    ``delay_s`` [s] is by how much its stamps are later than the IMU's, of one instant; it is subtracted.
-    ``gate`` is the part of readings that pass if noise and estimate are as stated: one that contradicts
-    the estimate by more is rejected. Raises InvalidInput for a delay of more than a minute, and for a gate
-    that is not above 0.5 and below 1.
+    Raises InvalidInput for a delay of more than a minute, and for a gate that is not above 0.5 and below 1.
     """
 
     delay_s: float = 0.0
@@ -79,8 +76,11 @@ class VelocityNoise(SourceNoise):
 
     ``sigma`` [m/s] are standard deviations in the axes of the measured frame; None if messages have them, as
     covariances. ``scale`` is the standard deviation of a constant relative error, as of a radius of wheels.
-    ``axes`` are the numbers that are used, some of x, y and z of the measured frame. Raises InvalidInput
-    unless all are finite, and sigmas above zero.
+    ``axes`` are the numbers that are used, some of x, y and z of the measured frame.
+
+    ``delay_s`` [s] is by how much its stamps are later than the IMU's, of one instant; it is subtracted.
+    ``gate`` is the part of readings that pass if noise and estimate are as stated: one that contradicts the
+    estimate by more is rejected. Raises InvalidInput unless all are finite, and sigmas above zero.
     """
 
     sigma: Sigma | None = None
@@ -107,7 +107,8 @@ class PoseNoise(SourceNoise):
     ``sigma`` [m] are standard deviations of the position, ``sigma_deg`` [degrees] of the rotation about the
     axes of the frame in which poses are measured; both are None if messages have them, as covariances.
     ``axes`` are the numbers that are used, some of x, y, z, roll, pitch and yaw, along and about the same
-    axes. Raises InvalidInput for one sigma without the other, and unless all are finite and above zero.
+    axes. ``delay_s`` and ``gate`` as of ``VelocityNoise``. Raises InvalidInput for one sigma without the
+    other, and unless all are finite and above zero.
     """
 
     sigma: Sigma | None = None
@@ -168,7 +169,8 @@ class MagnetometerNoise(SourceNoise):
     ``sigma_deg`` [degrees] is that of the yaw, by errors that do not average out. The field is ``soft_iron``
     (3, 3) times the measured one less ``bias`` [T], both in the axes of the sensor. ``place`` is a latitude
     and a longitude [degrees]: fields are then compared with that of the Earth there, not with the first ones.
-    Raises InvalidInput unless the sigma is above zero, all are finite, and it is a place.
+    ``delay_s`` and ``gate`` as of ``VelocityNoise``. Raises InvalidInput unless the sigma is above zero, all
+    are finite, and it is a place.
     """
 
     sigma_deg: float = 5.0
@@ -196,8 +198,8 @@ class FixNoise(SourceNoise):
 
     ``sigma`` [m] are standard deviations of a position; None if messages have them, as covariances. ``floor``
     [m] are the least that is believed: receivers with corrections (RTK) state millimetres. ``correlated_s``
-    [s] is for how long the errors of fixes wander before they are others. Raises InvalidInput unless all are
-    finite and above zero.
+    [s] is for how long the errors of fixes wander before they are others. ``delay_s`` and ``gate`` as of
+    ``VelocityNoise``. Raises InvalidInput unless all are finite and above zero.
     """
 
     sigma: FixSigma | None = None
@@ -239,7 +241,7 @@ class RelativeNoise(SourceNoise):
     ``covariance`` says what the covariances of its poses are: "stated", of no use, as those of most drivers,
     which send zeros or constants; "dependent", of dead reckoning, which only grow; "independent", of poses
     that are each measured, as by matching scans with a map. What they say is added to the floor, in place of
-    the sigmas. Raises InvalidInput for anything else.
+    the sigmas. ``delay_s`` and ``gate`` as of ``VelocityNoise``. Raises InvalidInput for anything else.
     """
 
     sigma: float = 0.05
@@ -269,8 +271,8 @@ class BarometerNoise(SourceNoise):
     ``sigma`` [m] is the standard deviation of each height; None if messages have it, as the variance of their
     pressures. ``wander`` [m] is that of an error that changes over ``correlated_s`` [s], by wind, doors and
     weather: raise it where hours of weather count. ``temperature_c`` is that of the air [degrees Celsius],
-    which makes it denser: 3 degrees are 1 % of a height. Raises InvalidInput unless all are finite, sigmas
-    and the time above zero, and the air above -100 degrees.
+    which makes it denser: 3 degrees are 1 % of a height. ``delay_s`` and ``gate`` as of ``VelocityNoise``.
+    Raises InvalidInput unless all are finite, sigmas and the time above zero, and the air above -100 degrees.
     """
 
     sigma: float | None = None

@@ -12,8 +12,8 @@ They have different stamps, no 10 s apart, and no reading of the present time ca
 and for other sources than the IMU none at all. So the clock of the IMU prevails over that of wheels that is
 ahead, and the readings that were held back until then are not lost.
 
-Of the order of arrival there remains: a reading that is ahead and is followed by one of the present is
-refused, in another order it may have been confirmed. Without jumps of more than ``history_s`` and a second
+The order of arrival still matters in one case: a reading that is ahead and is followed by one of the present
+is refused; in another order it may have been confirmed. Without jumps of more than ``history_s`` and a second
 the order does not matter.
 """
 

@@ -37,7 +37,8 @@ class WheelNoise(SourceNoise):
     ``slip`` is a part of the speed, ``speed`` [m/s] what is left at rest (resolution of the encoders, play),
     ``lateral`` and ``vertical`` [m/s] how far the velocity across the wheels and off the floor may be from
     zero. ``scale`` is that of the constant relative error of the radius, which shifts the position along the
-    way driven. Raises InvalidInput unless all are finite and, but for ``slip`` and ``scale``, above zero.
+    way driven. ``delay_s`` and ``gate`` as of ``VelocityNoise``. Raises InvalidInput unless all are finite
+    and, but for ``slip`` and ``scale``, above zero.
     """
 
     slip: float = 0.05
@@ -109,10 +110,11 @@ class Wheels(Protocol):
 class DiffDrive:
     """Wheels on one axle, ``track`` apart, whose middle is the origin of ``frame``.
 
-    ``left`` and ``right`` are names of joints, several on each side for skid steering; ``track`` is then
-    wider than the robot, about 1.5 times, and calibrated by a turn. Wheels of radius r at +-b/2 that rotate
-    by wl, wr move the base by r (wr + wl) / 2 and turn it by r (wr - wl) / b (Siegwart, Nourbakhsh,
-    Scaramuzza, Introduction to Autonomous Mobile Robots, 2nd ed., 3.2.2).
+    ``left`` and ``right`` are names of joints, several on each side for skid steering; ``track`` [m] is then
+    wider than the robot, about 1.5 times, and calibrated by a turn. ``radius`` [m] is that of each wheel,
+    ``noise`` that of the velocity. ``frame`` None is the base. Wheels of radius r at +-b/2 that rotate by wl,
+    wr move the base by r (wr + wl) / 2 and turn it by r (wr - wl) / b (Siegwart, Nourbakhsh, Scaramuzza,
+    Introduction to Autonomous Mobile Robots, 2nd ed., 3.2.2).
     """
 
     left: str | Sequence[str]
@@ -148,11 +150,12 @@ class DiffDrive:
 
 @dataclass(frozen=True, slots=True)
 class Ackermann:
-    """Two driven rear wheels, ``track`` apart, and steered front wheels ``wheelbase`` ahead of them.
+    """Two driven rear wheels, ``track`` [m] apart, and steered front wheels ``wheelbase`` [m] ahead of them.
 
-    The origin of ``frame`` is the middle of the rear axle. ``steering`` are the joints of the left and the
-    right front wheel, or one in the middle. A wheel at (l, y) that is steered by d has the curvature tan d /
-    (l + y tan d): its axis meets that of the rear axle (Siegwart et al., 3.3.3).
+    The origin of ``frame`` is the middle of the rear axle. ``left`` and ``right`` are the joints of the rear
+    wheels, ``steering`` those of the left and the right front wheel, or one in the middle. ``radius`` and
+    ``noise`` as of ``DiffDrive``. A wheel at (l, y) that is steered by d has the curvature tan d / (l + y tan
+    d): its axis meets that of the rear axle (Siegwart et al., 3.3.3).
     """
 
     left: str
@@ -214,9 +217,10 @@ class Mecanum:
     """Four wheels with rollers at 45 degrees, which form an X from above; their middle is the origin of
     ``frame``.
 
-    ``track`` and ``wheelbase`` are the distances of the wheels across and along. With k = (track + wheelbase)
-    / 2 the wheels have the rates (vx -+ vy -+ k w) / r (Taheri, Qiao, Ghaeminezhad, "Kinematic model of a
-    four Mecanum wheeled mobile robot", IJCA 113 (2015)).
+    ``front_left``, ``front_right``, ``rear_left`` and ``rear_right`` are their joints. ``track`` and
+    ``wheelbase`` [m] are the distances of the wheels across and along, ``radius`` and ``noise`` as of
+    ``DiffDrive``. With k = (track + wheelbase) / 2 the wheels have the rates (vx -+ vy -+ k w) / r (Taheri,
+    Qiao, Ghaeminezhad, "Kinematic model of a four Mecanum wheeled mobile robot", IJCA 113 (2015)).
     """
 
     front_left: str

@@ -16,7 +16,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.plugins import edge_streams, is_value, stream_named, streams_where
 from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
-from zstate.recording.encode import POSED_FRAME, TOPICS, StaticAccumulator
+from zstate.recording.encode import NUMBER, POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
 from zstate.streams import StreamName
@@ -36,6 +36,7 @@ from zstate.wire.ros2.streams import (
     has_sensor_topics,
     recorded_forms,
     ros_streams,
+    uncarried_number,
     without_suffix,
 )
 from zstate.wire.ros2.topics import SHARED, FrameNames, name_from_topic, robot_from_topic
@@ -106,7 +107,8 @@ class RecordedWriter:
         elif child_frame(channel) is None:
             for stream, carried in ros_streams().items():
                 is_named = name == stream or carried.is_named
-                if is_named and channel.type_name == carried.type.name:
+                is_of_type = channel.type_name == carried.type.name
+                if is_named and (is_of_type or carried.recorded_form(channel.type_name) is not None):
                     break
             else:
                 found = None if foreign else _stream_of_form(name, channel.type_name)
@@ -270,6 +272,8 @@ class DecodedRecording:
                 messages = (form.decode(record.payload, writer.session, seq),)
             elif channel.json is not None:
                 messages = (channel.json.decode(record.payload),)
+            elif (decode := channel.decode_form) is not None:
+                messages = (decode(record.payload, writer.session, seq, channel.names),)
             else:
                 topic = channel.topic
                 messages = channel.ros.messages(topic, record.payload, writer.session, seq, channel.names)
@@ -277,8 +281,9 @@ class DecodedRecording:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
         for message in messages:
-            field = channel.uncarried
-            content = with_field(message, field, channel.posed) if field else message
+            content = with_field(message, field, channel.posed) if (field := channel.uncarried) else message
+            if channel.number:
+                content = with_field(content, uncarried_number(writer.stream), channel.number)
             yield DecodedMessage(writer, content, record.log_time)
 
     def records(
@@ -320,10 +325,14 @@ class DecodedRecording:
                 json = None
                 if channel.encoding == JSON:
                     json = JsonDecoder(stream_named(writer.stream), channel.metadata.get(VERSION, "1"))
+                carried = ros_streams().get(writer.stream)
+                form = None if carried is None else carried.recorded_form(channel.type_name)
                 decoder = ChannelDecoder(
                     *(writer, topic, names, RosDecoder(), child_frame(channel) or ""),
                     posed and names.to_zstate(posed),
                     json,
+                    None if form is None else form.decode,
+                    int(channel.metadata.get(NUMBER, "0")),
                 )
             self._known[channel] = decoder
         return self._known[channel]
@@ -333,7 +342,9 @@ class ChannelDecoder(NamedTuple):
     """The writer of a channel, the stream that its topic is named after, and the decoder of its messages.
 
     A channel of covariances has those of the child frame ``covariances_of``, by its name in ROS; one of
-    poses, those of the frame ``posed``, empty for the base of the robot. ``json`` decodes a channel in JSON.
+    poses, those of the frame ``posed``, empty for the base of the robot. ``json`` decodes a channel in JSON,
+    ``decode_form`` one with messages in another form than ROS carries them. ``number`` is one of its messages
+    that ROS does not carry.
     """
 
     writer: RecordedWriter
@@ -343,6 +354,8 @@ class ChannelDecoder(NamedTuple):
     covariances_of: str
     posed: str
     json: JsonDecoder | None
+    decode_form: Callable[..., Message] | None
+    number: int
 
     @property
     def uncarried(self) -> str:
@@ -452,8 +465,8 @@ def recorded_model(
     """The model of a described robot, or None if its joint states cannot be used with it.
 
     That is the case without joint states, with a URDF that cannot be parsed, and if the first joint states
-    together lack a joint: in a bag of ROS the rest may be on another topic, or in tf alone. Of a robot with
-    ``partial_joint_states`` drivers may be missing, as they may be live.
+    together lack a joint: in a bag of ROS the rest may be on another topic, or in tf alone. A robot with
+    ``partial_joint_states`` may lack drivers, as it may live.
     """
     robot, message = description.writer.robot, description.message
     assert isinstance(message, RobotDescription)

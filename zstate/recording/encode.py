@@ -45,10 +45,18 @@ from zstate.wire.messages import (
     session_of,
 )
 from zstate.wire.ros2.cdr import to_time
-from zstate.wire.ros2.encoder import RosStreamEncoder
+from zstate.wire.ros2.encoder import RosStreamEncoder, checked_stamp
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import Qos
-from zstate.wire.ros2.streams import RecordedForm, recorded_forms, ros_stream
+from zstate.wire.ros2.streams import (
+    DisplayedForm,
+    RecordedForm,
+    displayed_form,
+    recorded_forms,
+    ros_stream,
+    uncarried_number,
+    without_suffix,
+)
 from zstate.wire.ros2.topics import SHARED, FrameNames, RmwKeys
 from zstate.wire.ros2.types import POSE_WITH_COVARIANCE
 
@@ -74,6 +82,9 @@ TOPICS: dict[StreamName, StreamName] = {"transforms": "tf", "partial_joint_state
 
 POSED_FRAME = "zstate.posed_frame"
 """Channel metadata key of the frame whose measured poses a channel has, as it is named in /tf."""
+
+NUMBER = "zstate.number"
+"""Channel metadata key of the number that ROS does not carry (``RosStream.uncarried_number``)."""
 
 _NAMED = SampleLayout()
 
@@ -141,7 +152,7 @@ class RecordingEncoder:
     its robot has opened too many channels ("too many writers", see ``OpenChannels``). It is also called for
     each map that is in one file only, since 128 MiB of maps are repeated in the files that follow ("map not
     repeated"). ``programs`` maps sessions to program names, as far as known when the first message of a
-    session is written.
+    session is written. ``for_viewer`` selects the forms that only viewers of live robots get.
     """
 
     def __init__(
@@ -151,8 +162,10 @@ class RecordingEncoder:
         *,
         alone: str | None = None,
         programs: Mapping[int, str] = MappingProxyType({}),
+        for_viewer: bool = False,
     ) -> None:
         self._writer = writer
+        self._for_viewer = for_viewer
         self._refuse = refuse
         self._root = {SHARED, alone}
         self._namespaces: dict[str, str] = {}
@@ -161,7 +174,7 @@ class RecordingEncoder:
         self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
         self._latched: dict[str, dict[str, ChannelEncoder]] = {}
         self._map_bytes: dict[str, int] = {}
-        """Of the maps that are repeated, by the keys of ``_latched_key``."""
+        """Sizes of the maps that are repeated, by the keys of ``_latched_key``."""
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
         self._orders: dict[str, OrderRegistry] = {}
         self._pending = PendingSamples()
@@ -264,7 +277,8 @@ class RecordingEncoder:
             for one in known_covariances(message, edges):
                 self._write_covariance(robot, message, one, log_time, edge_writer)
         child = getattr(message, ros_stream(TOPICS.get(stream, stream)).uncarried, "")
-        channel = self._channel(robot, stream, message.session, log_time, edge_writer, child=child)
+        form = self._form_of(stream, message)
+        channel = self._channel(robot, stream, message.session, log_time, edge_writer, child=child, form=form)
         if not self._writer.is_read(channel.number):
             return
         payload = channel.encode(message, sample_names)
@@ -339,7 +353,11 @@ class RecordingEncoder:
                 raise _TooManyWriters(
                     f"it has {MAX_LATCHED} latched messages; that of {edge_writer!r} is one more"
                 )
-            channel = self._channel(robot, stream, session_of(message), log_time, edge_writer)
+            form = self._form_of(stream, message)
+            number: int = getattr(message, uncarried_number(stream), 0)
+            channel = self._channel(
+                robot, stream, session_of(message), log_time, edge_writer, number=number, form=form
+            )
         payload = encode_json(message) if carried_as_json(stream) else channel.encode(message)
         with self._lock:
             # The maps of a fleet, with 16 MB each, would be most of a recording if they were repeated.
@@ -386,9 +404,14 @@ class RecordingEncoder:
         *,
         child: str = "",
         program: str = "",
+        number: int = 0,
+        form: DisplayedForm | None = None,
     ) -> ChannelEncoder:
-        """The channel of a writer's stream; with ``child`` of the covariances, or measured poses, of it."""
-        key = (stream, session, edge_writer, child)
+        """The channel of a writer's stream; with ``child`` of the covariances, or measured poses, of it.
+
+        With ``form`` that of its messages of this form; ``number`` is one that ROS does not carry.
+        """
+        key = (stream, session, edge_writer, child, number, form)
         opened = self._channels[robot]
         channel = opened.find(key)
         if channel is not None:
@@ -405,7 +428,9 @@ class RecordingEncoder:
         program = program or self._programs.get(session, "")
         if program:
             metadata["zstate.program"] = program
-        topic, kind, qos = self.topic(robot, stream, edge_writer)
+        topic, kind, qos = self.topic(robot, stream, edge_writer, form)
+        if number:
+            metadata[NUMBER] = str(number)
         if carried_as_json(stream):
             metadata |= {STREAM: stream, VERSION: str(stream_named(stream).version)}
         if child and ros_stream(TOPICS.get(stream, stream)).uncarried:
@@ -413,27 +438,47 @@ class RecordingEncoder:
         elif child:
             metadata[CHILD_FRAME] = in_ros = names.to_ros(child)
             topic, kind = covariance_topic(options.namespace, names.to_zstate(in_ros)), POSE_WITH_COVARIANCE
-        number = self._writer.channel(topic, kind, qos, metadata)
-        channel = ChannelEncoder(number, stream, names)
+        channel = ChannelEncoder(self._writer.channel(topic, kind, qos, metadata), stream, names, form)
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)
         return channel
 
-    def topic(self, robot: str, stream: StreamName, writer_name: str = "") -> tuple[str, ChannelType, Qos]:
+    def _form_of(self, stream: StreamName, message: Message) -> DisplayedForm | None:
+        """The form of ``message`` if it is not ROS's."""
+        form = displayed_form(stream)
+        if form is None or not (self._for_viewer or form.decode is not None):
+            return None
+        return form if form.applies(message) else None
+
+    def topics(
+        self, robot: str, stream: StreamName, writer_name: str = ""
+    ) -> dict[str, tuple[ChannelType, Qos]]:
+        """All topics of ``topic``: that of messages as ROS carries them, and that of their other form."""
+        found = [self.topic(robot, stream, writer_name)]
+        if (form := displayed_form(stream)) is not None:
+            found.append(self.topic(robot, stream, writer_name, form))
+        return {topic: (kind, qos) for topic, kind, qos in found}
+
+    def topic(
+        self, robot: str, stream: StreamName, writer_name: str = "", form: DisplayedForm | None = None
+    ) -> tuple[str, ChannelType, Qos]:
         """The topic that carries a stream of ``robot``, its type and its QoS.
 
-        ``writer_name`` is the name of a sensor, of odometry or of a map. Covariances, and measured poses of
-        a child, have further topics. Raises InvalidInput for an invalid name.
+        ``writer_name`` is the name of a sensor, of odometry or of a map. Covariances, measured poses of a
+        child, and messages in a ``form`` have further topics. Raises InvalidInput for an invalid name.
         """
         options = self._options(robot)
-        if (form := recorded_forms().get(stream)) is not None:
-            return form.topic_in(options.namespace), form.type, Qos()
+        if (recorded := recorded_forms().get(stream)) is not None:
+            return recorded.topic_in(options.namespace), recorded.type, Qos()
         if carried_as_json(stream):
             tokens = filter(None, (options.namespace, stream, writer_name and ros_name(writer_name)))
             return f"/{'/'.join(tokens)}", json_type(stream_named(stream)), Qos()
         carrier = TOPICS.get(stream, stream)
-        topic = RmwKeys(options).topic(robot, carrier, ros_name(writer_name))
-        return topic, *ros_stream(carrier)[:2]
+        topic: str = RmwKeys(options).topic(robot, carrier, ros_name(writer_name))
+        kind, qos = ros_stream(carrier)[:2]
+        if form is not None:
+            topic, kind = f"{without_suffix(topic)}/{form.suffix}", form.type
+        return topic, kind, qos
 
     def _options(self, robot: str) -> Ros2Options:
         """The namespace and the frame prefix of a robot. Raises InvalidInput for an invalid name."""
@@ -453,10 +498,16 @@ def _latched_key(robot: str, stream: StreamName, name: str) -> str:
 
 
 class ChannelEncoder:
-    """Encodes the messages of one writer on ``stream``, for the channel ``number`` of the file."""
+    """Encodes the messages of one writer on ``stream``, for the channel ``number`` of the file.
 
-    def __init__(self, number: ChannelId, stream: StreamName, names: FrameNames) -> None:
+    ``form`` is theirs, if it is not ROS's.
+    """
+
+    def __init__(
+        self, number: ChannelId, stream: StreamName, names: FrameNames, form: DisplayedForm | None = None
+    ) -> None:
         self.number = number
+        self._form = form
         self._stream: StreamName = stream
         self._names = names
         self._sample_names = _NAMED
@@ -467,6 +518,9 @@ class ChannelEncoder:
 
         Raises InvalidInput if CDR cannot represent it.
         """
+        if self._form is not None:
+            checked_stamp(getattr(message, "stamp", 0))
+            return self._form.encode(message, self._names)
         if sample_names is not self._sample_names:
             self._sample_names = sample_names
             self._encoder = RosStreamEncoder(self._names, sample_names)

@@ -469,18 +469,23 @@ class CsvTable(ColumnFile):
         self._file.close()
 
 
+def arrow() -> tuple[Any, Any]:
+    """The modules pyarrow and pyarrow.parquet. Raises LibraryMissing."""
+    try:
+        import pyarrow  # noqa: PLC0415 - an extra
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError as error:
+        raise LibraryMissing(
+            f"Parquet needs pyarrow, which cannot be loaded ({error}): pip install 'zstate[export]'"
+        ) from None
+    return pyarrow, parquet
+
+
 class ParquetTable(ColumnFile):
     """Parquet, compressed with Zstandard. Raises LibraryMissing without pyarrow."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            import pyarrow as arrow  # noqa: PLC0415 - an extra
-            from pyarrow import parquet  # noqa: PLC0415
-        except ImportError as error:
-            raise LibraryMissing(
-                f"Parquet needs pyarrow, which cannot be loaded ({error}): pip install 'zstate[export]'"
-            ) from None
-        self._arrow, self._parquet = arrow, parquet
+        self._arrow, self._parquet = arrow()
         self._path = path
         self._writer: ParquetWriter | None = None
         self._pending: list[Any] = []

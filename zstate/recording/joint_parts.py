@@ -82,7 +82,7 @@ class RecordedJoints:
             return self.whole
         names = JointNames(model).joints(state.names or (), others=writer.edge_writer is None)
         position = self._writers.setdefault(state.session, len(self._writers))
-        # Of two writers the later one counts, and of one writer's sets the larger one.
+        # The later one of two writers counts, and the larger one of a writer's sets.
         order = position * (len(model.joint_names) + 1) + len(names)
         if len(names) == len(model.joint_names):
             self.whole.parts.add_writer(state.session, order)

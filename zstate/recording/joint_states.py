@@ -134,7 +134,7 @@ class RecordedJointReader:
     def batches(self) -> Iterator[JointStateBatch]:
         """All samples in order of their stamps, which ascend across batches too.
 
-        A sample is passed on once another is 10 s newer. Of two samples with one stamp the later one counts.
+        A sample is passed on once another is 10 s newer. If two samples have one stamp, the later one counts.
         """
         pending: JointHistory | None = None
         restarts = False

@@ -24,7 +24,7 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
-from zstate.plugins import edge_streams, is_latched, is_measured, is_named, measured_streams
+from zstate.plugins import edge_streams, is_bulk, is_latched, is_measured, is_named, measured_streams
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, edges_with_more, static_key
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
@@ -89,7 +89,7 @@ class PlaybackPublishers(Closeable):
         self._others: dict[str, PassthroughPublisher] = {}
         self._parts: dict[str, JointPartPlayback] = {}
         self._named: dict[_Named, PassthroughPublisher] = {}
-        """Of sensors and of odometry."""
+        """Publishers of sensors and of odometry."""
         self._copied = {_edge_of_odometry(one) for one in writers} & set(writers)
         """The writers of edges that odometry has as well."""
         self._open_passthrough = partial(
@@ -332,7 +332,7 @@ class JointPartPlayback(Closeable):
     """Publishes the recorded joint states of drivers of ``robot``, each set of joints by a writer of its own.
 
     A driver that was restarted under another name, as by default, continues as the writer of its
-    predecessor. Of two sets with joints in common the one that counts is as in ``RecordedJoints``: the writer
+    predecessor. If two sets have joints in common, one counts, as in ``RecordedJoints``: the writer
     of the other set is closed. Nodes of ROS, whose joint states have no names, are named "recorded-1" and so
     on. ``open_publisher(robot, streams, name)`` opens a writer; it may raise SecondWriter. Without a
     ``model`` the joints are not owned.
@@ -428,6 +428,8 @@ class PassthroughPublisher(Closeable):
         self._sessions = sessions
         self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[StreamName] = Counter()
+        self._recorded: dict[StreamName, tuple[int, int]] = {}
+        """The recorded session and number of the last sample."""
         self._latched: dict[tuple[StreamName, str], list[LatchedWriter]] = {}
         self._placed: dict[str, set[Edge]] = {}
         self._values: set[tuple[StreamName, str]] = set()
@@ -460,8 +462,17 @@ class PassthroughPublisher(Closeable):
         stream: StreamName = next(one for one in _carrying(message) if one in self._streams)
         if isinstance(message, TransformSample) and stream in edge_streams():
             self._own(message.edges or ())
+        self._seqs[stream] += self._missing_before(stream, message)
         write_all(self._streams[stream], renumbered(message, self._seqs[stream], self._session_id))
         self._seqs[stream] += 1
+
+    def _missing_before(self, stream: StreamName, message: StampedMessage) -> int:
+        """How many samples of bulk data the recording has lost: the packets of a video need each other."""
+        before = self._recorded.get(stream)
+        self._recorded[stream] = message.session, message.seq
+        if not is_bulk(stream) or before is None or before[0] != message.session:
+            return 0
+        return max(message.seq - before[1] - 1, 0)
 
     def own_joints(self, edges: Sequence[Edge]) -> None:
         """Own joints, given by their edges, until the end. Raises SecondWriter if one has another writer."""

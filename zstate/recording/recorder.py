@@ -10,7 +10,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -148,6 +148,12 @@ class SampleRecorder:
         self._wire = wire
         self._counters = counters
         self._gaps = GapCounter(counters)
+        self._missing: Counter[tuple[str, StreamName]] = Counter()
+
+    @property
+    def missing(self) -> dict[tuple[str, StreamName], int]:
+        """How many samples are missing between those written, by robot and stream."""
+        return dict(self._missing)
 
     def start_batch(self, batch: Batch) -> None:
         """Begin with the samples of ``batch``."""
@@ -187,7 +193,9 @@ class SampleRecorder:
             # The numbers of stops rise by any steps.
             is_of_stops = is_named(stream) and stream in recorded_forms()
             if is_known and isinstance(message, StampedMessage) and not is_of_stops:
-                self._gaps.add((robot, stream, message.session), message.seq)
+                missing = self._gaps.add((robot, stream, message.session), message.seq)
+                if missing:
+                    self._missing[robot, stream] += missing
         return messages
 
 
@@ -209,7 +217,8 @@ class RecorderStats:
     size of all ``files``. Messages were ``dropped`` by a full ring of this process, by a full queue or at the
     end of the recording, ``missed`` between the writers' sequence numbers, ``unwritten`` without a matching
     description; ``refused`` counts others that could not be written, by reason. A disk that is full has
-    ``lost`` that many of the ``messages``.
+    ``lost`` that many of the ``messages``. ``missing`` has the dropped and missed ones between others of the
+    same writer, by robot and stream.
     """
 
     messages: Mapping[tuple[str, StreamName], int]
@@ -220,6 +229,7 @@ class RecorderStats:
     refused: Mapping[str, int]
     unwritten: int
     lost: int = 0
+    missing: Mapping[tuple[str, StreamName], int] = field(default_factory=dict[tuple[str, StreamName], int])
 
     def _repr_html_(self) -> str:
         return html_of_fields(self)
@@ -310,6 +320,7 @@ class Recorder(Closeable):
             refused=received.refused,
             unwritten=0 if encoder is None else encoder.unwritten,
             lost=writer.lost,
+            missing=self._samples.missing,
         )
 
     def wait(self, timeout_s: float | None = None) -> bool:

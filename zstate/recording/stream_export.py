@@ -1,4 +1,7 @@
-"""Export of a stream of a plugin as a table, one row for each message, in the order of recording.
+"""Export of a stream of a plugin as a table, in the order of recording; and as files of points.
+
+A message is one row; one of a stream with ``columns`` (``zstate.streams``) is several, with these in place of
+its fields.
 
 ===========  =========================================================================================
 column       content
@@ -9,12 +12,15 @@ column       content
 each field   a number or a text, also an optional one (NaN, or an empty text, without a value); others
              are in JSON
 ===========  =========================================================================================
+
+A file of points is PLY (Turk, "The PLY polygon file format", 1994), binary, with the columns of one message
+that PLY has types for, as the properties of its vertices.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -22,8 +28,9 @@ from typing import Any, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.lazy_names import loaded
 from zstate._util.refusals import Refusals
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, RecordingError
 from zstate.plugins import stream_named
 from zstate.recording.decode import DecodedMessage
 from zstate.recording.export import TableFormat, new_table
@@ -36,12 +43,16 @@ _ROWS = 4096
 """Rows written together."""
 
 _NUMBERS: dict[Any, type[Any]] = {float: np.float64, float | None: np.float64, int: np.int64, bool: np.bool_}
+_PLY_TYPES = {
+    **{"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
+    **{"f4": "float", "f8": "double"},
+}
 
 
 def export_stream(
     recording: Recording, stream: StreamName, path: Path, kind: TableFormat, *, overwrite: bool = False
 ) -> tuple[int, Mapping[str, int]]:
-    """Write the messages of ``stream``; the number of rows, and of messages left out, by reason.
+    """Write the messages of ``stream``; returns the number of rows, and of messages left out, by reason.
 
     The file appears when it is complete. Raises RecordingError and LibraryMissing as ``new_table`` does, and
     InvalidInput as ``Recording.measurements`` does, for messages with blocks of numbers, without a message,
@@ -49,21 +60,108 @@ def export_stream(
     """
     refusals = Refusals(f"recorded {stream}")
     messages = recording.measurements(stream, refuse=refusals.count)
+    tables = _tables_of_rows(messages, stream)
+    if stream_named(stream).columns:
+        tables = (_with_writer(decoded, columns) for decoded, columns in _tables(messages, stream, refusals))
+    count, names = 0, list[str]()
+    with new_table(path, kind, recording, overwrite=overwrite) as table:
+        for columns in tables:
+            if names and list(columns) != names:
+                raise InvalidInput(
+                    f"the messages of {stream!r} have the columns {', '.join(names)} and later "
+                    f"{', '.join(columns)}, and a table has one set; export one robot, or record one sensor"
+                )
+            names = list(columns)
+            table.write(columns)
+            count += len(columns["stamp"])
+        _check_has_any(count, stream, refusals)
+    return count, refusals.counts
+
+
+def export_points(
+    recording: Recording, stream: StreamName, folder: Path, *, overwrite: bool = False
+) -> tuple[int, Mapping[str, int]]:
+    """Write each message of ``stream`` into a file of ``folder``, ROBOT.WRITER.STAMP.ply; returns as above.
+
+    Raises RecordingError if the folder exists (unless ``overwrite``) or cannot be written, and InvalidInput
+    for a stream whose messages are no points, and without a message.
+    """
+    if not stream_named(stream).columns:
+        raise InvalidInput(f"the messages of {stream!r} are no points: export them with --csv or --parquet")
+    refusals = Refusals(f"recorded {stream}")
+    messages = recording.measurements(stream, refuse=refusals.count)
+    count = 0
+    try:
+        folder.mkdir(parents=True, exist_ok=overwrite)
+        for decoded, columns in _tables(messages, stream, refusals):
+            stamp = getattr(decoded.message, "stamp")  # noqa: B009 - of measurements
+            name = f"{decoded.writer.robot}.{decoded.writer.edge_writer or stream}.{stamp}.ply"
+            write_ply(folder / name, columns)
+            count += 1
+    except FileExistsError as error:
+        text = f"{str(folder)!r} exists; choose another name, or pass overwrite=True"
+        raise RecordingError(text, path=str(folder)) from error
+    except OSError as error:
+        text = f"{str(folder)!r} cannot be written: {error.strerror or error}"
+        raise RecordingError(text, path=str(folder)) from error
+    _check_has_any(count, stream, refusals)
+    return count, refusals.counts
+
+
+def write_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write points with ``columns`` into a file; columns of types that PLY does not have are left out."""
+    kept = {name: column for name, column in columns.items() if column.dtype.str[1:] in _PLY_TYPES}
+    count = len(next(iter(columns.values())))
+    points = np.zeros(count, [(name, f"<{column.dtype.str[1:]}") for name, column in kept.items()])
+    for name, column in kept.items():
+        points[name] = column
+    properties = (f"property {_PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in kept.items())
+    header = ("ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header")
+    path.write_bytes("".join(f"{line}\n" for line in header).encode() + points.tobytes())
+
+
+def _tables(
+    messages: Iterable[DecodedMessage], stream: StreamName, refusals: Refusals
+) -> Iterator[tuple[DecodedMessage, dict[str, NDArray[Any]]]]:
+    """Each message with its columns, without those that have none."""
+    make = loaded(stream_named(stream).columns)
+    for decoded in messages:
+        try:
+            yield decoded, make(decoded.message, decoded.writer.robot)
+        except InvalidInput as error:
+            refusals.count("malformed", str(error))
+
+
+def _with_writer(decoded: DecodedMessage, columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """``columns`` with those of robot and writer behind the stamps."""
+    count = len(columns["stamp"])
+    writer = decoded.writer
+    names = {"robot": writer.robot, "writer": writer.edge_writer or ""}
+    return {
+        "stamp": columns["stamp"],
+        **{name: np.full(count, text, object) for name, text in names.items()},
+        **{name: column for name, column in columns.items() if name != "stamp"},
+    }
+
+
+def _tables_of_rows(
+    messages: Iterator[DecodedMessage], stream: StreamName
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """The columns of many messages, a row each."""
     hints = get_type_hints(stream_named(stream).type)
     if blocks := [name for name, hint in hints.items() if hint in (bytes, bytes | None)]:
         raise InvalidInput(
             f"{stream!r} has no columns: {', '.join(blocks)} of its messages are blocks of numbers; read "
             "them with zstate.Recording"
         )
-    rows = 0
-    with new_table(path, kind, recording, overwrite=overwrite) as table:
-        while batch := list(islice(messages, _ROWS)):
-            table.write(_columns(batch, hints))
-            rows += len(batch)
-        if not rows:
-            reasons = ", ".join(f"{reason} {count}" for reason, count in refusals.counts.items())
-            raise InvalidInput(f"no message of {stream!r} can be used: {reasons or 'there is none'}")
-    return rows, refusals.counts
+    while batch := list(islice(messages, _ROWS)):
+        yield _columns(batch, hints)
+
+
+def _check_has_any(count: int, stream: StreamName, refusals: Refusals) -> None:
+    if not count:
+        reasons = ", ".join(f"{reason} {number}" for reason, number in refusals.counts.items())
+        raise InvalidInput(f"no message of {stream!r} can be used: {reasons or 'there is none'}")
 
 
 def _columns(batch: Sequence[DecodedMessage], hints: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

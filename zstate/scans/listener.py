@@ -22,11 +22,11 @@ _LIMITS = ByteLimits(unread=64 * 2**20, waiting=16 * 2**20)
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """A scan whose rays stand in ``target``: ``points`` (N, 3) [m], NaN where ``valid`` (N,) is False.
+    """A ``scan`` whose rays stand in ``target``: ``points`` (N, 3) [m], NaN where ``valid`` (N,) is False.
 
-    Each ray is placed by the pose at its own stamp. It is not valid if its range is no measurement, or if the
-    history of the buffer begins after it. ``is_rigid`` means that the times of the rays are not known, and
-    all are placed by the pose at the stamp of the scan.
+    ``sensor`` is the name of the scanner. Each ray is placed by the pose at its own stamp. It is not valid if
+    its range is no measurement, or if the history of the buffer begins after it. ``is_rigid`` means that the
+    times of the rays are not known, and all are placed by the pose at the stamp of the scan.
     """
 
     scan: Scan
@@ -60,13 +60,14 @@ class ScanListener(PlacingListener[Scan, PlacedScan]):
     ``for placed in scans`` and ``async for placed in scans`` return a PlacedScan for each scan, in the order
     in which they became placeable, and end with ``close()``. A scan waits for the pose of its *last* ray, at
     most ``timeout_s`` from its arrival: then it is counted in ``dropped`` by the name of the error, and
-    ``last_reason`` names the edge that was too late. Of more than 256 scans or 64 MiB that are unread, or
-    256 scans or 16 MiB of one sensor that wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
+    ``last_reason`` names the edge that was too late. If more than 256 scans or 64 MiB are unread, or
+    256 scans or 16 MiB of one sensor wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
     ``refused`` counts messages that are no scan, by reason; the first of each reason is also logged.
 
     ``sensor`` selects one scanner of the robot, on the native wire; "*": all of them. Frames come from
     ``buffer``; without one, the listener fills a buffer of its own with the transforms of the robot. Bare
-    frame names are the robot's own. A context manager.
+    frame names are the robot's own. ``clock`` is that of the buffer of its own; default: the system's. A
+    context manager.
     """
 
     def __init__(

@@ -37,14 +37,18 @@ class ScanPublisher(MeasurementPublisher):
     """Publishes the scans of one laser scanner of a robot, whose geometry is given once.
 
     ``sensor`` is the scanner's name, in ROS its topic. Its frame is ``frame``, by default a frame of the
-    sensor's name; a bare name is the robot's own. The other numbers are those of a ``Scan``. Leave
-    ``ray_ns`` out only if the sensor measures all rays at once, or does not tell their times: listeners then
-    place each scan rigidly.
+    sensor's name; a bare name is the robot's own. ``angle_min`` and ``angle_increment`` [rad], ``range_min``
+    and ``range_max`` [m] and ``ray_ns`` [ns] are those of a ``Scan``. Leave ``ray_ns`` out only if the sensor
+    measures all rays at once, or does not tell their times: listeners then place each scan rigidly.
+
+    ``wires`` are what it publishes on, "native" (the default), "ros2" with options, or several. ``clock``
+    gives the stamps of scans without one; default: the system's. ``program`` is the writer's name for others;
+    default: the script's name.
 
     Under congestion scans are dropped, and joining listeners receive none from the past. On the native wire
     each sensor has one writer: SecondWriter, which names the first one, is raised if another writer publishes
-    it, or by ``publish`` if both opened at once, which closes the later one. ``program`` is the script's name
-    by default. A context manager; safe from any thread.
+    it, or by ``publish`` if both opened at once, which closes the later one. A context manager; safe from any
+    thread.
     """
 
     def __init__(
@@ -139,6 +143,7 @@ class MapPublisher(ValuePublisher):
 
     A place is a robot, whose name is that of the place ("hall"), or a map that a robot has made. The frame of
     the map is ``frame`` if it is given, else that of the grid. ``writer`` distinguishes maps of one robot.
+    ``wires`` and ``program`` as of ``ScanPublisher``.
     ``close()`` withdraws the map; the ROS wires cannot express that. On the native wire SecondWriter, which
     names the first writer, is raised if another active writer publishes this map. A context manager.
     """

@@ -49,7 +49,8 @@ _Array = NDArray[np.float64]
 class SimulatedLaser:
     """A laser scanner that measures the occupied cells of ``grid``; outside of it all is free.
 
-    The geometry is that of a Scan of ``ray_count`` rays, by default of ROS 2's dummy_laser. ``noise_m`` is
+    ``angle_min`` and ``angle_increment`` [rad], ``ray_ns`` [ns], ``range_min`` and ``range_max`` [m] and
+    ``frame`` are those of a Scan of ``ray_count`` rays, by default of ROS 2's dummy_laser. ``noise_m`` is
     the standard deviation of Gaussian noise on each measured range [m], drawn from ``seed``. Raises
     InvalidInput for a geometry that a Scan refuses, and for a grid whose origin is tilted or has a z.
     """
@@ -97,7 +98,7 @@ class SimulatedLaser:
         return self._rays.stamps() + stamp
 
     def scan(self, stamp: int, x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> Scan:
-        """The scan that starts at ``stamp`` [ns]; see ``ranges``."""
+        """The scan that starts at ``stamp`` [ns]; ``x``, ``y`` and ``yaw`` as of ``ranges``."""
         return replace(self._rays, stamp=stamp, ranges=self.ranges(x, y, yaw))
 
     def scan_in_space(self, stamp: int, poses: ArrayLike) -> Scan:

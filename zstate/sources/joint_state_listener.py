@@ -104,8 +104,8 @@ class JointStateListener(Closeable):
     """Receives the joint states of ``robot``; also a joint source for a ``StatePublisher``.
 
     ``for reading in listener`` and ``async for reading in listener`` return each sample once, in order of
-    arrival, and end with ``close()``; ``read`` returns the newest unread one. Of more than 1024 unread
-    samples the oldest are dropped. ``on_reading(reading)`` is called with each sample, from one thread: keep
+    arrival, and end with ``close()``; ``read`` returns the newest unread one. If more than 1024 samples are
+    unread, the oldest are dropped. ``on_reading(reading)`` is called with each sample, from one thread: keep
     it short.
 
     If the joints come from several drivers, each with its own joints (``PartialStatePublisher``, in ROS any

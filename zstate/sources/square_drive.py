@@ -61,9 +61,10 @@ class WheelPair(NamedTuple):
 class SquareDrive:
     """A base drives a square with rounded corners, counterclockwise, one lap in ``period_s`` [s].
 
-    A function of the stamp alone: programs that publish parts of the motion agree at every instant. The lap
-    starts and ends at the identity in the odometry frame. ``side_m`` is the length of a side between the
-    prolonged sides, ``corner_m`` the radius of the arcs. Raises InvalidInput if there is no such path.
+    ``wheels`` are the two that drive the base. A function of the stamp alone: programs that publish parts of
+    the motion agree at every instant. The lap starts and ends at the identity in the odometry frame.
+    ``side_m`` is the length of a side between the prolonged sides, ``corner_m`` the radius of the arcs.
+    Raises InvalidInput if there is no such path.
     """
 
     def __init__(

@@ -315,7 +315,7 @@ def _write_snapshot(
         moving = source.snapshot().tree.tracks_of
         return all(moving.get(robot) for robot in robots) if robots else bool(moving)
 
-    # Of a robot with a model, transforms may arrive first.
+    # The transforms of a robot with a model may arrive first.
     if not _wait_for(source, has_models, _ANNOUNCED_WITHIN_S) and not has_frames():
         received = ", ".join(map(repr, source.robots())) or "none"
         expected = " and ".join(map(repr, robots)) or "any robot"

@@ -41,11 +41,11 @@ _TIMEOUT_S = 1.0
 _MAX_WAITING = 256
 _MAX_KEPT = 1000
 _SCAN_BYTES = 4_000_000
-"""Of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
+"""Limits of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
 _CLOUD_BYTES = 128_000_000
-"""Of the waiting and of the kept clouds of one sensor: 4 million points with intensity, ring and time."""
+"""Limits of the waiting and of the kept clouds of one sensor: 4 million points with intensity and time."""
 _PICTURE_BYTES = 64_000_000
-"""Of the pictures of one camera: 500 of 720 rows."""
+"""The limit of the pictures of one camera: 500 of 720 rows."""
 CLOUD_POINTS = 200_000
 """The points that are kept of each cloud of a sensor without a limit of its own."""
 _MAX_WRITERS = 64

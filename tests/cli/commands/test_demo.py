@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
 
+import numpy as np
 import pytest
 from helpers.cli_runner import (
     RRBOT,
@@ -19,6 +21,7 @@ from helpers.cli_runner import (
 from helpers.processes import DEADLINE_S, Child, until
 
 from zstate import Kinematics, TransformListener, connect, load_model
+from zstate.cameras import CameraListener
 from zstate.model import catalog
 from zstate.odometry import DiffDrive, WheelNoise
 from zstate.odometry.cli.rover import ROVER_BASE, ROVER_JOINTS, ROVER_MODEL, ROVER_WHEELS, settings_file
@@ -145,16 +148,34 @@ def test_a_program_of_the_rover_that_dies_ends_the_demo(spawn: Spawn, number: in
 
 
 @pytest.mark.processes
-def test_other_commands_see_the_rover_and_its_room_without_an_option(spawn: Spawn):
-    demo = started(spawn, "demo", "rover")
-    until(lambda: "receiving 'rover'" in demo.stderr)
-    robots = json.loads(run_cli("ls", "--json").stdout)
-    room, rover = robots
-    writers = {(one["stream"], one["program"]) for one in rover["writers"]}
-    assert (room["robot"], rover["robot"]) == ("room", "rover")
-    assert {("joint_states", "rover-wheels"), ("imu", "rover-imu"), ("scan", "rover-laser")} <= writers
-    assert "odometry" in {stream for stream, _ in writers}
+def test_the_camera_of_the_rover_sees_its_lidar_where_its_transforms_put_it(spawn: Spawn):
+    """Against the odometry nothing is compared: the mount of the camera and the lidar are on the base."""
+    demo = started(spawn, "demo", "rover", "--camera")
+    with (
+        connect() as session,
+        TransformListener(session, "rover") as listener,
+        CameraListener(session, "rover", "front") as pictures,
+    ):
+        picture = next(one for one in pictures if one.camera is not None)
+        listener.buffer.wait("rover/base_link", picture.frame, timeout_s=DEADLINE_S)
+        corner = 0.04 / math.sqrt(2.0)  # inside of the lidar, a dark cylinder of 0.04 x 0.05 m
+        places = [(x, y, 0.02) for x in (-corner, corner) for y in (-corner, corner)]
+        pixels, valid = listener.buffer.project(places, "rover/lidar_link", picture.camera, picture.stamp)
+        assert valid.all()
+        u, v = np.rint(pixels.mean(axis=0)).astype(int).tolist()
+        brightness = picture.decode().max(axis=2)
+    assert brightness[v, u] < 80
+    left, right = (int(edge) for edge in (pixels[:, 0].min() - 40, pixels[:, 0].max() + 40))
+    assert min(brightness[v, left], brightness[v, right]) > 100  # the base or the floor beside it
+    until(lambda: "its camera is image/front: zstate view, zstate echo rover --stream image" in demo.stderr)
     interrupted(demo)
+
+
+@pytest.mark.processes
+def test_only_the_rover_has_a_camera():
+    assert "--camera is for 'rover' alone; got 'rrbot'" in failure("demo", "rrbot", "--camera", code=2)
+    with missing_library("simplejpeg"):
+        assert "pip install 'zstate[cameras]'" in failure("demo", "rover", "--camera")
 
 
 @pytest.mark.processes
@@ -252,12 +273,16 @@ def test_demos_that_start_at_once_take_names_of_their_own(spawn: Spawn):
 
 
 @pytest.mark.processes
-def test_second_rover_and_its_room_have_names_of_their_own(spawn: Spawn):
+def test_other_commands_see_two_rovers_and_their_rooms_by_names_of_their_own(spawn: Spawn):
     demos = [started(spawn, "demo", "rover") for _ in range(2)]
     for demo in demos:
         until(lambda demo=demo: "it drives a square" in demo.stderr)
-    names = {robot["robot"] for robot in json.loads(run_cli("ls", "--json").stdout)}
-    assert names == {"rover", "rover-2", "room", "room-2"}
+    robots = {robot["robot"]: robot for robot in json.loads(run_cli("ls", "--json").stdout)}
+    assert robots.keys() == {"rover", "rover-2", "room", "room-2"}
+    for rover in ("rover", "rover-2"):
+        writers = {(one["stream"], one["program"]) for one in robots[rover]["writers"]}
+        assert {("joint_states", "rover-wheels"), ("imu", "rover-imu"), ("scan", "rover-laser")} <= writers
+        assert "odometry" in {stream for stream, _ in writers}
     for demo in demos:
         interrupted(demo)
 

@@ -333,3 +333,19 @@ def test_sensor_that_is_not_published_is_explained():
         message = failure("echo", "rrbot", "--stream", "imu", "--once", "--timeout", "1")
     assert "imu of 'rrbot' has no writer; start the program of the sensor" in message
     assert "zstate.odometry.ImuPublisher" in message
+
+
+def test_it_ends_after_the_seconds_that_are_given():
+    with published_robot():
+        ended = run_cli("echo", "rrbot", "--field", "seq", "--seconds", "0.5")
+    numbers = list(map(int, ended.stdout.splitlines()))
+    assert len(numbers) > 1
+    assert numbers == sorted(set(numbers))
+
+
+def test_without_samples_it_fails_after_the_seconds_with_the_reason():
+    assert "gave up after 0.5 s" in failure("echo", "rrbot", "--seconds", "0.5")
+
+
+def test_seconds_are_refused_with_once():
+    assert "--timeout limits the wait" in failure("echo", "rrbot", "--once", "--seconds", "1", code=2)

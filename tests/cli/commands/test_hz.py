@@ -68,3 +68,7 @@ def test_stream_without_writer_is_named_with_a_command_that_publishes_it():
 
 def test_a_window_of_one_is_wrong_usage():
     assert "--window" in failure("hz", "rrbot", "--window", "1", code=2)
+
+
+def test_without_samples_it_fails_after_the_seconds_with_the_reason():
+    assert "gave up after 0.5 s" in failure("hz", "rrbot", "--seconds", "0.5")

@@ -205,3 +205,19 @@ def test_all_edges_on_ros_side_have_their_ros_names(ros_router: str):
     with published_robot(wire="ros2", router=ros_router):
         lines = run_cli("monitor", "--once").stdout.splitlines()
     assert [line.split()[:2] for line in lines[1:4]] == [["lower", "pose"], ["upper", "pose"], ["*", FIXED]]
+
+
+@pytest.mark.parametrize("what", [(), ("base", "lower"), ("--robots",)])
+def test_it_ends_after_the_seconds_that_are_given(what: tuple[str, ...]):
+    with published_robot():
+        ended = run_cli("monitor", *what, "--seconds", "2", "--json")
+    assert 1 <= len(ended.stdout.splitlines()) <= 2
+
+
+@pytest.mark.parametrize("what", [(), ("base", "lower"), ("--robots",)])
+def test_without_robots_it_fails_after_the_seconds_with_the_reason(what: tuple[str, ...]):
+    assert "gave up after 0.5 s" in failure("monitor", *what, "--seconds", "0.5")
+
+
+def test_seconds_are_refused_with_once():
+    assert "--timeout limits the wait" in failure("monitor", "--once", "--seconds", "1", code=2)

@@ -193,3 +193,20 @@ def test_a_bare_name_of_two_robots_lists_both():
     assert "'r1/world'" in tried[-1].stderr
     assert "'r2/world'" in tried[-1].stderr
     assert named.code == 0
+
+
+def test_it_ends_after_the_seconds_that_are_given():
+    with published_robot():
+        ended = run_cli("tf", "base", "lower", "--rate", "10", "--seconds", "0.5", "--json")
+    poses = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert 1 <= len(poses) <= 5
+    assert {pose["source"] for pose in poses} == {"lower"}
+
+
+def test_without_a_pose_it_fails_after_the_seconds_with_the_reason():
+    assert "gave up after 0.5 s" in failure("tf", "base", "lower", "--seconds", "0.5")
+
+
+@pytest.mark.parametrize("single", [("--once",), ("--at", "5")])
+def test_seconds_are_refused_where_one_pose_is_printed(single: tuple[str, ...]):
+    assert "--timeout limits the wait" in failure("tf", "base", "lower", "--seconds", "1", *single, code=2)

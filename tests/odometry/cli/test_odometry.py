@@ -195,14 +195,14 @@ def test_requests_place_the_base_of_a_running_odometry_and_start_it_anew(spawn: 
             (("--set-pose", "2", "1", "90"), "placed the base at x 2 m, y 1 m, yaw 90 deg", (2, 1, 1.5708)),
             (
                 ("--reset", "--set-pose", "-3", "0.5", "0"),
-                "started anew and placed the base at",
+                "restarted and placed the base at",
                 (-3, 0.5, 0),
             ),
         ):
             ended = run_cli(*request, *options)
             assert ended.stdout.startswith(f"the odometry 'legs' of 'walker' {done}"), ended.stderr
             until(lambda: place() == pytest.approx(expected, abs=0.05))  # noqa: B023
-        assert run_cli(*request, "--reset").stdout == "the odometry 'legs' of 'walker' started anew\n"
+        assert run_cli(*request, "--reset").stdout == "the odometry 'legs' of 'walker' restarted\n"
         refused = failure("odometry", "walker", "--reset")
         assert "no reply at 'zstate/walker/@odometry/odometry' within 2 s" in refused
     interrupted(live)

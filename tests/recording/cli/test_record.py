@@ -135,6 +135,13 @@ def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record, "_DISK_WINDOW_NS", 900_000_000)
 
 
+def test_what_is_lost_is_named_by_its_stream():
+    missing = {("r1", "cloud"): 61, ("r1", "image"): 2}
+    stats = RecorderStats({("r1", "cloud"): 100}, 9, (Path("run.mcap"),), 22, 41, {}, 0, missing=missing)
+    text = "22 dropped here, 41 missed on the way (61 of r1 cloud, 2 of r1 image)"
+    assert record._lost(stats) == text
+
+
 @pytest.mark.parametrize(("part_of_a_day", "is_warned"), [(0.8, True), (1.25, False)])
 def test_a_disk_that_is_full_within_a_day_at_the_rate_of_ten_seconds_is_a_single_warning(
     tmp_path: Path, part_of_a_day: float, is_warned: bool

@@ -114,7 +114,7 @@ def test_slider_moves_the_joint_and_the_displayed_link_pose(panels, sessions):
         page.view_tab.save_screenshot("panels_joints")
 
 
-def test_slider_panel_names_the_conflicting_writer(panels, sessions):
+def test_conflicting_writer_is_named_by_the_sliders_and_in_the_graph(panels, sessions):
     with (
         StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver,
         SliderPublisher(sessions[1], RRBOT, "r1") as sliders,
@@ -123,6 +123,10 @@ def test_slider_panel_names_the_conflicting_writer(panels, sessions):
         page = panels(sessions[1], "r1", sliders=[sliders])
         assert "driver@" in page.view_tab.text("r1 is not published").inner_text()
         page.view_tab.save_screenshot("panels_refused")
+        page.open("Graph")
+        until(lambda: page.row("written by").startswith("driver@"))
+        page.view_tab.save_screenshot("panels_graph")
+        page.open("Joints")
         driver.close()
         until(lambda: not discover(sessions[0], 0.2))
         page.press("Try again")
@@ -281,19 +285,6 @@ def test_time_is_paused_and_returns_to_live(panels, sessions, spawn):
     until(lambda: page.row("quat xyzw") != before)
 
 
-def test_display_options_are_shared_by_all_browsers(open_tab, show_view, sessions):
-    with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver:
-        driver.publish([0.0, 0.0])
-        shown = show_view(sessions[1], "r1")
-        mine, theirs = (Panels(open_tab(shown.page.url, 640, 480)) for _ in range(2))
-        assert not theirs.field("Names").is_checked()
-        mine.field("Names").check()
-        mine.choose("Fixed frame", "r1/tool")
-        until(lambda: shown.view.scene.names)
-        until(lambda: theirs.field("Names").is_checked())
-        until(lambda: theirs.field("Fixed frame").input_value() == "r1/tool")
-
-
 def test_names_from_the_network_are_shown_and_not_executed(panels, sessions):
     name = "<img src=x onerror=document.title=1>"
     quoted = name.replace("<", "&lt;").replace(">", "&gt;")
@@ -308,12 +299,3 @@ def test_names_from_the_network_are_shown_and_not_executed(panels, sessions):
         until(lambda: page.row("parent") == "r1/base")
         assert page.tab.locator('img[src="x"]').count() == 0
         assert page.tab.title() != "1"
-
-
-def test_graph_tab_lists_writers_of_streams(panels, sessions):
-    with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver:
-        driver.publish([0.0, 0.0])
-        page = panels(sessions[1], "r1")
-        page.open("Graph")
-        until(lambda: page.row("written by").startswith("driver@"))
-        page.view_tab.save_screenshot("panels_graph")

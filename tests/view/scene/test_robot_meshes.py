@@ -296,7 +296,9 @@ def corner_of(pose) -> tuple[float, ...]:
     return tuple((np.round(corner, 3) + 0.0).tolist())
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 8))]
+)
 @pytest.mark.long
 def test_each_robot_is_drawn_once_at_its_pose_after_random_changes(server, seed: int):
     changes = RandomChanges(server, seed)

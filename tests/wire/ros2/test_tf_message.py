@@ -131,11 +131,14 @@ def test_payloads_of_equal_length_with_other_frame_lengths_differ():
 @pytest.mark.long
 def test_changing_frames_do_not_fill_the_memory():
     decoder = TfMessageDecoder()
+    of_each_length = [
+        cdr(tf_message([0], [("map", f"person0000{'x' * length}")], [POSE])) for length in range(9)
+    ]
     tracemalloc.start()
     try:
         for number in range(5000):
-            edges = [("map", f"person{number}{'x' * (number % 9)}")]
-            decoder.decode(cdr(tf_message([0], edges, [POSE])))
+            named = of_each_length[number % 9].replace(b"person0000", f"person{number:04}".encode())
+            assert decoder.decode(named).edges[0][1].startswith(f"person{number:04}")
         held, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

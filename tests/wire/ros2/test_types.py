@@ -8,10 +8,13 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zstate.wire.ros2.types import (
+    CAMERA_INFO,
     CLOCK,
+    COMPRESSED_IMAGE,
     DIAGNOSTIC_ARRAY,
     FLOAT64_MULTI_ARRAY,
     FLUID_PRESSURE,
+    IMAGE,
     IMU,
     JOINT_STATE,
     JOINT_TRAJECTORY,
@@ -46,6 +49,9 @@ TYPES = (
     MAGNETIC_FIELD,
     ODOMETRY,
     POINT_CLOUD2,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    CAMERA_INFO,
 )
 EACH = pytest.mark.parametrize("kind", TYPES, ids=[kind.name for kind in TYPES])
 

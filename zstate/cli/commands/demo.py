@@ -85,9 +85,10 @@ class Demo(NamedTuple):
 @click.argument("robot", type=options.MODEL, required=False)
 @options.xacro_arguments
 @click.option("--world", is_flag=True, help="Put rrbot into a room, which its laser sweeps.")
+@click.option("--camera", is_flag=True, help="Give the rover a camera, image/front.")
 @options.rate_option
 @options.seconds_option
-# Of the process with the hardware that `zstate demo rover` starts; its ROBOT is the name of the rover.
+# For the process with the hardware that `zstate demo rover` starts; its ROBOT is the name of the rover.
 @click.option("--program", type=click.Choice(("wheels",)), hidden=True, allow_from_autoenv=False)
 @options.plain_session_options
 def demo_command(
@@ -95,6 +96,7 @@ def demo_command(
     robot: str | None,
     xacro_args: dict[str, str],
     world: bool,
+    camera: bool,
     rate: float,
     seconds: float | None,
     program: Literal["wheels"] | None,
@@ -110,7 +112,8 @@ def demo_command(
     `zstate demo rover` is a mobile robot with simulated wheels, IMU and laser in a room. One process is its
     hardware, another one `zstate odometry`, which estimates odom -> base_footprint. It drives a square until
     its first command, such as by `zstate move rover --keys` in another terminal. The room and the laser need
-    pip install 'zstate[maps]'.
+    pip install 'zstate[maps]'. With --camera it also has a camera on a mast, which sees the room and the
+    rover itself; this needs pip install 'zstate[cameras]'.
 
     `zstate demo rrbot --world` has four processes: two more publish the map of a room, and the scans of the
     laser on the arm, simulated in that map. `zstate view` draws all of it. Needs pip install 'zstate[maps]'.
@@ -119,6 +122,7 @@ def demo_command(
     zstate demo
     zstate demo path/to/arm.urdf --rate 500
     zstate demo rover
+    zstate demo rover --camera
     zstate demo rrbot --world
     """
     from zstate.model.catalog import example_name
@@ -128,11 +132,13 @@ def demo_command(
         from zstate.odometry.cli.rover import run_rover
 
         with open_session(network) as session:
-            run_rover(session, rate, robot or _ROVER)
+            run_rover(session, rate, robot or _ROVER, with_camera=camera)
         return
     source = robot or (_ARM if world else example_name())
     if world and (source != _ARM or xacro_args):
         raise click.UsageError(f"--world is for {_ARM!r} alone; got {source!r}")
+    if camera and source != _ROVER:
+        raise click.UsageError(f"--camera is for {_ROVER!r} alone; got {source!r}")
     if source == _ROVER and xacro_args:
         raise click.UsageError(f"{_ROVER!r} takes no xacro arguments; got {', '.join(xacro_args)}")
     if not (robot or world) and source != _DEFAULT:
@@ -146,7 +152,7 @@ def demo_command(
         if world:
             demo = _robot_in_room(names)
         elif source == _ROVER:
-            demo = _rover(names)
+            demo = _rover(names, with_camera=camera)
         else:
             demo = _swinging_robot(source, xacro_args, names)
         _run(session, demo, _environment(session_options), rate, seconds, on_pose=turn.close)
@@ -230,20 +236,27 @@ def _swinging_robot(source: str, xacro_args: Mapping[str, str], names: _Names) -
     return Demo(name, model, model.root, links, {"publisher": arguments})
 
 
-def _rover(names: _Names) -> Demo:
+def _rover(names: _Names, *, with_camera: bool) -> Demo:
     """A mobile robot: one program is its hardware, another one its odometry, and one publishes the room."""
     from zstate.odometry.cli import rover
 
+    if with_camera:
+        rover.check_camera()
     model, _ = load_robot(rover.ROVER_MODEL, None)
     name = names.free(_ROVER)
+    advice = f"it drives a square until it is commanded: zstate move {name} --keys"
+    if with_camera:
+        advice += (
+            f"; its camera is image/{rover.ROVER_CAMERA}: zstate view, zstate echo {name} --stream image"
+        )
     demo = Demo(
         name,
         model,
         rover.ROVER_ODOM,
         (rover.ROVER_LASER, "left_wheel", "right_wheel"),
-        rover.programs(name),
+        rover.programs(name, with_camera=with_camera),
         ("joint_states", "transforms"),
-        advice=f"it drives a square until it is commanded: zstate move {name} --keys",
+        advice=advice,
     )
     if rover.load_room() is None:
         print_status("without a room and its laser, which need pip install 'zstate[maps]'")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -35,6 +36,7 @@ def _check_amount(amount: float) -> float:
     show_default=True,
 )
 @click.option("--once", is_flag=True, help="Print one document; fail after --timeout with the reason.")
+@options.seconds_option
 @options.timeout_option("How long --once waits [s].")
 @click.option("--field", metavar="NAME", help="Print only this: stamp, positions, positions.JOINT, or JOINT.")
 @click.option(
@@ -58,6 +60,7 @@ def echo_command(
     robot: str | None,
     stream: StreamName,
     once: bool,
+    seconds: float | None,
     timeout: float,
     field: str | None,
     changed: bool,
@@ -70,8 +73,8 @@ def echo_command(
 
     ROBOT may be left out if only one robot is announced. Transforms, and partial joint states, are those of
     all their writers; on a ROS wire these are all messages of /tf, or /joint_states. Joint setpoints are what
-    the program that owns the robot's hardware writes to it, while it moves or holds the joints. Of known
-    covariances of odometry and measurements the standard deviations are printed, in the same units. A
+    the program that owns the robot's hardware writes to it, while it moves or holds the joints. Known
+    covariances of odometry and measurements are printed as standard deviations, in the same units. A
     scan or a map is a summary: geometry and counts; --json, --csv and --field also have the ranges of a scan
     [m], null where nothing was measured.
 
@@ -117,6 +120,7 @@ def echo_command(
         else:
             print_result(f"{yaml_text(value)}\n---")
 
+    options.check_end(seconds, once=once)
     refuse_topic(robot, wire)
     with (
         open_session(network, (wire,)) as session,
@@ -131,14 +135,15 @@ def echo_command(
             document = partial(row.to_document, robot=selected, in_full=(form or field) is not None)
         carrying = carrier(get_wire(wire), stream)
         reader = opened.enter_context(StreamReader(session, selected, carrying, wire))
-        received = reader.first(timeout if once else None)
-        while True:
+        received = reader.first(timeout if once else seconds)
+        end = math.inf if seconds is None else time.monotonic() + seconds
+        while time.monotonic() < end:
             if received is not None:
                 sample: Any = received.sample  # of the class that ``stream`` carries
                 show(document(sample))
             if once:
                 return
-            received = reader.next(LONGEST_WAIT_S)
+            received = reader.next(min(LONGEST_WAIT_S, end - time.monotonic()))
 
 
 def _with_nulls(value: Any) -> Any:

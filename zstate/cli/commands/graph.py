@@ -33,8 +33,8 @@ _PROGRAM_FILL = "#eef2ff"
 def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the writers and readers of the streams of ROBOT, or of all robots.
 
-    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear. Of a
-    robot with a driver, joint_commands go from its commander to the driver.
+    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear. If
+    a robot has a driver, joint_commands go from its commander to the driver.
     Streams that are read but have no writer stand out. On a ROS wire: the nodes and the topics of robot
     states, in all namespaces.
 
@@ -92,8 +92,7 @@ def _discover_measured_graph(session: Session) -> Graph:
             *measured_streams(),
             "joint_commands",
         )
-        for stream in always:
-            statistics.subscribe(stream)
+        statistics.watch(always)
         robots = discover(session)
         check_found(robots)
         readers = discover_readers(session, _READERS_WITHIN_S)
@@ -113,8 +112,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         statistics.wait(expected, _MEASURED_WITHIN_S)
 
         def rate_hz(robot: str, stream: StreamName, writer: WriterId) -> float | None:
-            source = statistics.get(WriterKey(robot, stream, writer.session))
-            return None if source is None else source.published_hz()
+            return statistics.published_hz(WriterKey(robot, stream, writer.session))
 
         return build_graph(robots, readers, rate_hz)
 

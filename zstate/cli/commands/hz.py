@@ -76,13 +76,14 @@ def hz_command(
 
     of_all = is_ros(wire) or is_named(stream)
     stream = carrier(get_wire(wire), stream)
+    options.check_end(seconds, once=once)
     refuse_topic(robot, wire)
     with (
         open_session(network, (wire,)) as session,
         StreamReader(session, named_robot(session, robot, wire), stream, wire) as reader,
     ):
         statistics = MessageStatistics(window, of_all=of_all)
-        reader.first(timeout if once else None)
+        reader.first(timeout if once else seconds)
         _read_for(_SETTLING_S, reader, MessageStatistics(2))  # what queued up while this process was starting
         deadline, silent = time.monotonic() + timeout, False
         end = math.inf if seconds is None else time.monotonic() + seconds

@@ -109,8 +109,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         measured_streams = streams_where(lambda row: row.is_measured or row.group in ("joints", "edges"))
-        for measured_stream in measured_streams:
-            statistics.subscribe(measured_stream)
+        statistics.watch(measured_streams)
         facts = partial(_robots_facts, statistics=statistics)
         if watch:
             with RobotDirectory(session) as directory:
@@ -168,10 +167,11 @@ def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, wid
         for stream, writer in robot.writers:
             names = [one for one in robot.names_of(writer, stream) if one != MODEL_WRITER]
             shown = f"  {stream}/{','.join(names)}" if names else f"  {stream}"
-            rate = age = ""
-            source = statistics.get(WriterKey(robot.name, stream, writer.session))
+            key = WriterKey(robot.name, stream, writer.session)
+            source, published_hz, age = statistics.get(key), statistics.published_hz(key), ""
+            rate = "" if published_hz is None else rate_text(published_hz)
             if source is not None:
-                rate = "silent" if source.is_stale() else rate_text(source.published_hz())
+                rate = "silent" if source.is_stale() else rate_text(published_hz)
                 age = format_duration(round(source.silent_s() * 1e9))
             start = datetime.fromtimestamp(writer.since // 1_000_000_000).astimezone()
             lasting = _lasting_text(time.time_ns() - writer.since)
@@ -199,12 +199,13 @@ def _robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> l
     from zstate.net.topic_statistics import WriterKey
 
     def writer_facts(robot: RobotInfo, stream: StreamName, writer: WriterId) -> dict[str, Any]:
-        source = statistics.get(WriterKey(robot.name, stream, writer.session))
+        key = WriterKey(robot.name, stream, writer.session)
+        source = statistics.get(key)
         return {
             "stream": stream,
             **asdict(writer),
             "names": robot.names_of(writer, stream),
-            "rate_hz": None if source is None else source.published_hz(),
+            "rate_hz": statistics.published_hz(key),
             "silent_s": None if source is None else source.silent_s(),
         }
 

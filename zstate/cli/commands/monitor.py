@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -31,7 +32,7 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import printable
-from zstate.plugins import edge_streams, is_own, measured_streams
+from zstate.plugins import edge_streams, is_bulk, is_own, measured_streams
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import ANY, check_robot
 
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from zstate.net.topic_statistics import IntervalStatistics
     from zstate.nodes.listener import Follow, TransformListener
     from zstate.nodes.metered_buffer import MeteredBuffer, RobotMeasure
+    from zstate.transform import Transform
     from zstate.wire.messages import Status
 
 _FIRST_AFTER_S = 1.0
@@ -62,6 +64,7 @@ _WITHIN_NS = 2_000_000_000
 @click.option("--robots", is_flag=True, help="Monitor robots rather than edges: one line for each.")
 @click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
 @options.timeout_option("How long --once waits for the pose, or for a robot.")
+@options.seconds_option
 @options.robot_filter_option
 @options.placer_option
 @options.json_option()
@@ -77,6 +80,7 @@ def monitor_command(
     robots: bool,
     once: bool,
     timeout: float,
+    seconds: float | None,
     robot: str,
     placers: tuple[str, ...] | None,
     wire: str,
@@ -121,11 +125,12 @@ def monitor_command(
         raise click.UsageError("--metrics needs --robots")
     if target is not None and source is None:
         raise click.UsageError(f"{target!r} is one frame; give two frames, or none for all edges")
-    follow, once_s = default_stream(wire), timeout if once else None
+    options.check_end(seconds, once=once)
+    follow, within_s = default_stream(wire), timeout if once else seconds
     with (
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as directory,
-        open_clock(session, clock, wire, timeout_s=once_s) as selected_clock,
+        open_clock(session, clock, wire, timeout_s=within_s) as selected_clock,
         ExitStack() as opened,
     ):
         if robots:
@@ -134,7 +139,7 @@ def monitor_command(
                 rows = [listener_rows(monitor.robots), writer_rows(directory)]
                 rows += opened.enter_context(plugin_rows(session, robot))
                 opened.enter_context(serve_metrics(metrics, *rows))
-            _report_robots(monitor, once_s, as_json=as_json)
+            _report_robots(monitor, within_s, once=once, as_json=as_json)
             return
         listener = opened.enter_context(
             TransformListener(
@@ -149,13 +154,13 @@ def monitor_command(
         )
         statistics = opened.enter_context(EdgeStatistics(session, robot, wire, follow, listener.buffer.clock))
         if target is None or source is None:
-            monitored = AllEdges(listener, statistics, directory)
+            monitored = AllEdges(listener, statistics, directory, within_s)
         else:
-            monitored = PathEdges(listener, statistics, directory, (target, source))
-        _report_edges(monitored, once_s, as_json=as_json)
+            monitored = PathEdges(listener, statistics, directory, within_s, (target, source))
+        _report_edges(monitored, seconds, once=once, as_json=as_json)
 
 
-def _report_edges(monitored: AllEdges, once_s: float | None, *, as_json: bool) -> None:
+def _report_edges(monitored: AllEdges, seconds: float | None, *, once: bool, as_json: bool) -> None:
     from zstate.clock import SystemClock
     from zstate.rate import Rate
 
@@ -165,47 +170,49 @@ def _report_edges(monitored: AllEdges, once_s: float | None, *, as_json: bool) -
         else:
             print_result(f"{monitored.text(output_width())}\n")
 
-    monitored.wait(once_s)
+    monitored.wait()
     Event().wait(_FIRST_AFTER_S)
-    if once_s is not None:
+    if once:
         report()
     elif as_json or not is_terminal():
-        for _ in Rate(1.0, SystemClock(), Event()):
+        for _ in Rate(1.0, SystemClock(), Event(), seconds):
             report()
     else:
-        keep_showing(lambda: monitored.text(terminal_width()))
+        keep_showing(lambda: monitored.text(terminal_width()), seconds)
 
 
-def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool) -> None:
+def _report_robots(monitor: RobotMonitor, within_s: float | None, *, once: bool, as_json: bool) -> None:
     from zstate.clock import SystemClock
     from zstate.rate import Rate
 
     forever = Event()
     forever.wait(_DISCOVERY_S)
-    if once_s is None:
-        for _ in Rate(1.0, SystemClock(), forever):
-            monitor.report(as_json=as_json)
-            monitor.update()
-        return
-    deadline = time.monotonic() + once_s
+    deadline = math.inf if within_s is None else time.monotonic() + within_s
     while reason := monitor.update():
         if time.monotonic() > deadline:
-            fail(f"gave up after {once_s:g} s: {reason}")
+            fail(f"gave up after {within_s:g} s: {reason}")
         forever.wait(_DISCOVERY_S)
     forever.wait(_FIRST_AFTER_S)
-    monitor.report(as_json=as_json)
+    for _ in Rate(1.0, SystemClock(), forever, 1.0 if once else within_s):
+        monitor.report(as_json=as_json)
+        monitor.update()
 
 
 class AllEdges:
     """All edges that ``listener`` receives, as measured."""
 
     def __init__(
-        self, listener: TransformListener, statistics: EdgeStatistics, directory: RobotDirectory
+        self,
+        listener: TransformListener,
+        statistics: EdgeStatistics,
+        directory: RobotDirectory,
+        within_s: float | None,
     ) -> None:
         self._listener, self._statistics, self._directory = listener, statistics, directory
+        self._within_s = within_s
 
-    def wait(self, timeout_s: float | None) -> None:
-        """Wait until there are edges; prints what is missing, and fails after ``timeout_s``."""
+    def wait(self) -> None:
+        """Wait until there are edges; prints what is missing, and fails after ``within_s``."""
         from zstate.cli.waiting import ConditionWaiter
 
         def reason() -> str:
@@ -214,8 +221,8 @@ class AllEdges:
 
         waiter = ConditionWaiter()
         self._listener.add_observer(waiter.notify)
-        if not waiter.wait_for(self._rows, timeout_s, reason):
-            fail(f"gave up after {timeout_s:g} s: {reason()}")
+        if not waiter.wait_for(self._rows, self._within_s, reason):
+            fail(f"gave up after {self._within_s:g} s: {reason()}")
 
     def text(self, width: int | None) -> str:
         from zstate.cli.edge_statistics import overview_text
@@ -247,21 +254,25 @@ class PathEdges(AllEdges):
         listener: TransformListener,
         statistics: EdgeStatistics,
         directory: RobotDirectory,
+        within_s: float | None,
         frames: tuple[str, str],
     ) -> None:
         from zstate.cli.waiting import PoseWaiter
 
-        super().__init__(listener, statistics, directory)
+        super().__init__(listener, statistics, directory, within_s)
         self._frames = frames
         self._pose = PoseWaiter(listener, directory, *frames)
 
-    def wait(self, timeout_s: float | None) -> None:
-        self._pose.wait(timeout_s=timeout_s)
+    def wait(self) -> None:
+        self._wait()
+
+    def _wait(self) -> Transform:
+        return self._pose.wait(timeout_s=self._within_s)
 
     def text(self, width: int | None) -> str:
         from zstate.cli.edge_statistics import path_text, time_text
 
-        transform, (target, source) = self._pose.wait(), self._frames
+        transform, (target, source) = self._wait(), self._frames
         age_s = self._pose.age_s(transform)
         newest = "at any time (static)" if transform.stamp is None else "there"
         if age_s is not None:
@@ -270,7 +281,7 @@ class PathEdges(AllEdges):
         return self._pose.translate(f"pose of {source} in {target}: {newest}\n{table}")
 
     def json(self) -> dict[str, Any]:
-        transform, (target, source) = self._pose.wait(), self._frames
+        transform, (target, source) = self._wait(), self._frames
         return {
             "target": target,
             "source": source,
@@ -328,8 +339,9 @@ class RobotMonitor(Closeable):
         self._counted = self._opened.enter_context(counted)
         # The streams with a rate apart from that of the joint states; on a ROS wire edges are on /tf, which
         # the listener counts.
-        self._rated = (*edge_streams(), *measured_streams())
-        carried = filter(get_wire(wire).carries, measured_streams()) if is_ros(wire) else self._rated
+        measured = [stream for stream in measured_streams() if not is_bulk(stream)]
+        self._rated = (*edge_streams(), *measured)
+        carried = filter(get_wire(wire).carries, measured) if is_ros(wire) else self._rated
         for stream in carried:
             counted.subscribe(stream, robot)
 

@@ -49,6 +49,7 @@ def _parse_stamp(text: str) -> int:
 @click.option("--once", is_flag=True, help="Print one pose; fail after --timeout with the reason.")
 @click.option("--at", type=options.Checked("STAMP", _parse_stamp), help="Print one pose, at this stamp.")
 @options.timeout_option("How long --once and --at wait [s].")
+@options.seconds_option
 @click.option("--rate", type=options.RATE, default=1.0, help="Maximum rate of printed poses; default: 1.")
 @click.option("--twist", is_flag=True, help="Also print the velocity of B in A.")
 @click.option(
@@ -73,6 +74,7 @@ def tf_command(
     once: bool,
     at: int | None,
     timeout: float,
+    seconds: float | None,
     rate: float,
     twist: bool,
     precision: int,
@@ -100,10 +102,11 @@ def tf_command(
     from zstate.rate import Rate
 
     ends = once or at is not None
+    options.check_end(seconds, once=ends)
     with (
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as directory,
-        open_clock(session, clock, wire, timeout_s=timeout if ends else None) as selected_clock,
+        open_clock(session, clock, wire, timeout_s=timeout if ends else seconds) as selected_clock,
         TransformListener(
             session,
             robot,
@@ -141,8 +144,8 @@ def tf_command(
             return
         shown: Transform | None = None
         deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
-        for _ in Rate(rate, SystemClock(), Event()):
-            transform = waiter.wait()
+        for _ in Rate(rate, SystemClock(), Event(), seconds):
+            transform = waiter.wait(timeout_s=seconds)
             if transform != shown:
                 show(transform)
                 deadline.on_sample(time.monotonic())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import sys
@@ -134,12 +135,16 @@ def report_text(report: RateReport) -> str:
     return f"{samples}; {rates}, skipped {report.skipped}"
 
 
-def keep_showing(text: Callable[[], str], every_s: float = 0.5) -> NoReturn:
-    """Show ``text()`` in its place on the terminal, again and again, as much of it as fits."""
+def keep_showing(text: Callable[[], str], seconds: float | None = None, *, every_s: float = 0.5) -> None:
+    """Show ``text()`` in its place on the terminal, again and again, as much of it as fits.
+
+    Returns after ``seconds``; None: never.
+    """
     from rich.live import Live  # few commands need rich
     from rich.text import Text
 
+    end = math.inf if seconds is None else time.monotonic() + seconds
     with Live(auto_refresh=False) as live:
-        while True:
+        while time.monotonic() < end:
             live.update(Text(text(), no_wrap=True, overflow="crop"), refresh=True)
             time.sleep(every_s)

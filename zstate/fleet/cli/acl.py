@@ -11,6 +11,7 @@ from zstate.cli.output.console import print_result
 _ROLES = {
     "robot": "A robot: writes its own keys; reads these, the clock and the states of drivers",
     "viewer": "Reads everything and writes nothing but stops",
+    "state_viewer": "A viewer that does not read pictures, or what else shows people and places",
     "operator": "A commander that also calls ROS services",
     "timekeeper": "A viewer that also writes the simulated time",
     "placer": "Writes static edges as robot NAME and nothing else, for instance where robots are in a map",
@@ -20,7 +21,9 @@ _ROLES = {
 
 def _role_options(command: Any) -> Any:
     for role, text in reversed(_ROLES.items()):
-        option = click.option(f"--{role}", multiple=True, metavar="NAME", help=f"{text}; may be repeated.")
+        option = click.option(
+            f"--{role.replace('_', '-')}", multiple=True, metavar="NAME", help=f"{text}; may be repeated."
+        )
         command = option(command)
     return command
 
@@ -64,8 +67,7 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     from zstate.fleet.router_config import access_text
 
     if not any(roles.values()):
-        *others, last = (f"--{role} NAME" for role in _ROLES)
+        *others, last = (f"--{role.replace('_', '-')} NAME" for role in _ROLES)
         raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
-    robots, viewers, operators, timekeepers, placers, commanders = (roles[role] for role in _ROLES)
-    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers, commanders)
+    fleet = AclRoles(**{f"{role}s": roles[role] for role in _ROLES}, namespace=namespace, wires=wires)
     print_result(access_text(fleet).rstrip("\n"))

@@ -152,7 +152,7 @@ NO_REPLY = DenialReason(
     "connections are accepted and nothing is answered: the router process is stopped, or busy with other "
     "connections that never complete (deploy/README.md: firewall), or it is no router",
 )
-"""Of a listener that accepts connections without a reply: not a denial, as it may be temporary."""
+"""A listener accepts connections and does not reply: not a denial, as it may be temporary."""
 
 _NO_TLS = DenialReason(
     "no TLS there",

@@ -37,7 +37,7 @@ _MOST_INTERVALS = 20_000
 _LEAST_INTERVALS = 20
 
 _LEAST_PART = 0.5
-"""Of the variance of the source that the IMU explains; less is no motion that both measure."""
+"""The least part of a source's variance that the IMU explains; less is no motion that both measure."""
 
 _LARGEST_SIGMA_S = 0.02
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from zstate.sources import JointReading
 
 _LEAST_SAMPLES, _LEAST_S = 64, 2.0
-"""Of the IMU, to measure its noise."""
+"""The least samples of the IMU, and their duration, to measure its noise."""
 _BLOCK_S = 0.5
 _MOST_RATE_CHANGE, _MOST_FORCE_CHANGE, _MOST_FORCE_OFF = 0.02, 0.3, 0.5
 """[rad/s], [m/s^2]: means over half a second of an IMU at rest are as near each other, and to gravity."""

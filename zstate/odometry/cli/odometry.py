@@ -190,14 +190,14 @@ _INIT_S = 5.0
 @click.option(
     "--reset",
     is_flag=True,
-    help="Have the odometry that runs as --writer start anew: pose, biases and alignment, at rest.",
+    help="Restart the odometry that runs as --writer: pose, biases and alignment, at rest.",
 )
 @click.option(
     "--set-pose",
     type=float,
     nargs=3,
     metavar="X Y YAW",
-    help="Have it place the base there [m, degrees], at z = 0; with --reset it starts anew there.",
+    help="Have it place the base there [m, degrees], at z = 0; with --reset it restarts there.",
 )
 @click.option(
     "--replay",
@@ -327,7 +327,7 @@ def odometry_command(
 
 
 def _check_options(known: Collection[str], purpose: str) -> None:
-    """Refuse options that have no use beside those of ``purpose``."""
+    """Refuse options that have no use with those of ``purpose``."""
     context = click.get_current_context()
     for one in context.command.params:
         name = one.name or ""
@@ -362,7 +362,7 @@ def _request(session: Session, robot: str, writer: str, *, reset: bool, place: P
 
     pose = None if place is None else planar_transform("odom", "base", place)
     request_odometry(session, robot, "reset" if reset else "set_pose", pose, writer=writer)
-    done = ["started anew"] if reset else []
+    done = ["restarted"] if reset else []
     if place is not None:
         done.append("placed the base at x {:g} m, y {:g} m, yaw {:g} deg".format(*place))
     print_wrapped(f"the odometry {writer!r} of {robot!r} {' and '.join(done)}")

@@ -52,7 +52,7 @@ _HEALTH_NS = 500_000_000
 """Interval of the points of the NIS."""
 
 _WIDTH = 80
-"""Of the table [letters]."""
+"""The width of the table [letters]."""
 _LEGEND = (
     "NIS: mean square of the innovations in sigmas, by number; 1 is right. sigma: the factor on the "
     "sigmas of the source that would make it so. delay: how much later its stamps are than those of the IMU, "
@@ -69,7 +69,7 @@ _UNSTEADY = 10.0
 
 _ELLIPSES = 40
 _RADIUS_95 = math.sqrt(-2.0 * math.log(0.05))
-"""Of an ellipse that has 95 % of a normal distribution in the plane, in standard deviations."""
+"""The radius of an ellipse that has 95 % of a normal distribution in the plane, in standard deviations."""
 
 _PATH, _PANEL = 6.0, 2.0
 """Heights of the path and of each source [inch]."""

@@ -1,4 +1,4 @@
-"""The rover of `zstate demo rover`: its simulated hardware, in a room if maps can be read."""
+"""The rover of `zstate demo rover`: its simulated hardware, in a room if maps can be read, with a camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from zstate.cli.options import load_robot
 from zstate.errors import Closed, LibraryMissing
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from zstate.buffer.buffer import TransformBuffer
+    from zstate.cameras import Camera, SimulatedCamera, StampedPicture
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.odometry import ImuPublisher
@@ -30,6 +34,8 @@ ROVER_WHEELS = 0.08, 0.32
 """Radius and track of diffbot's wheels [m]."""
 ROVER_JOINTS = "left_wheel_joint", "right_wheel_joint"
 ROVER_LASER, ROVER_IMU = "lidar_link", "imu_link"
+ROVER_CAMERA, ROVER_LENS = "front", "front_optical"
+"""The camera's name and its frame, which a static edge places: the model has none."""
 
 _IMU_HZ = 200.0
 _GYRO_BIAS, _ACCEL_BIAS = (0.002, -0.001, 0.003), (0.03, -0.02, 0.05)
@@ -38,6 +44,12 @@ _ACCELERATION = 20.0
 """Limit of the wheels, of which the URDF has none [rad/s^2]."""
 
 _SCAN_HZ, _RAY_COUNT, _RANGE_M, _RANGE_NOISE_M = 10.0, 720, 8.0, 0.005
+_CAMERA_HZ, _CAMERA_SIZE, _FOCAL_PX, _DISTORTION = 10.0, (640, 480), 450.0, (-0.12, 0.02, 0.0, 0.0, 0.0)
+_MAST, _MAST_XYZ, _MAST_PITCH = "base_link", (-0.2, 0.0, 0.34), math.radians(20.0)
+_WORLD, _FLOOR, _WALLS = "world", "the floor", "the walls"
+_OPTICAL_RPY = -math.pi / 2, 0.0, -math.pi / 2
+"""Of the frame of a lens, z forward, in a frame with x forward."""
+
 _REST_NS = 3_000_000_000
 """The rover rests so long after its first odometry, which begins where it stands."""
 
@@ -59,10 +71,11 @@ def settings_file() -> Path:
     return _file("rover.toml")
 
 
-def programs(robot: str) -> dict[str, tuple[str, ...]]:
+def programs(robot: str, *, with_camera: bool = False) -> dict[str, tuple[str, ...]]:
     """The arguments of the `zstate` processes that publish the rover ``robot``, by name."""
+    camera = ("--camera",) if with_camera else ()
     return {
-        "wheels": ("demo", robot, "--program", "wheels"),
+        "wheels": ("demo", robot, "--program", "wheels", *camera),
         "odometry": ("odometry", robot, "--file", str(settings_file())),
     }
 
@@ -77,8 +90,18 @@ def load_room() -> Grid | None:
         return None
 
 
-def run_rover(session: Session, rate_hz: float, robot: str = ROVER) -> None:
-    """Host the driver of the wheels of the rover ``robot``, publish its IMU and its laser, until a signal."""
+def check_camera() -> None:
+    """Raises LibraryMissing without a library of simulated cameras and their pictures."""
+    import numpy as np
+
+    from zstate.cameras import SimulatedCamera
+    from zstate.cameras.codecs import to_jpeg
+
+    to_jpeg(SimulatedCamera(_lens(), {}).picture({})[:8, :8].astype(np.uint8), 80)
+
+
+def run_rover(session: Session, rate_hz: float, robot: str = ROVER, *, with_camera: bool = False) -> None:
+    """Host the driver of the wheels of the rover ``robot``, publish its sensors, until a signal."""
     from zstate.driving import DriverHost, Limits
     from zstate.driving.cli.drive import run_host
     from zstate.nodes.listener import TransformListener
@@ -112,6 +135,8 @@ def run_rover(session: Session, rate_hz: float, robot: str = ROVER) -> None:
         room = load_room()
         if room is not None:
             opened.enter_context(_start_laser(session, robot, room, rover, mounts[ROVER_LASER]))
+        if with_camera:
+            opened.enter_context(_start_camera(session, robot, room, rover, model))
         run_host(host, None)
 
 
@@ -197,6 +222,74 @@ class _RoverLaser:
         cosine, sine = np.cos(yaw), np.sin(yaw)
         ahead, left = cosine * self._x - sine * self._y, sine * self._x + cosine * self._y
         return self._laser.scan(first, x + ahead, y + left, yaw + self._yaw)
+
+
+def _lens() -> Camera:
+    from zstate.cameras import Camera
+
+    width, height = _CAMERA_SIZE
+    k = _FOCAL_PX, _FOCAL_PX, (width - 1) / 2, (height - 1) / 2
+    return Camera(width, height, k, _DISTORTION, frame=ROVER_LENS)
+
+
+def _camera_mount() -> Transform:
+    from zstate.transform import Transform
+
+    mast = Transform.from_rpy(_MAST, "mast", _MAST_XYZ, (0.0, _MAST_PITCH, 0.0))
+    return mast @ Transform.from_rpy("mast", ROVER_LENS, (0.0, 0.0, 0.0), _OPTICAL_RPY)
+
+
+def _start_camera(
+    session: Session, robot: str, room: Grid | None, rover: SimulatedRover, model: RobotModel
+) -> ExitStack:
+    """Publish the mount of the camera and its pictures, until the stack is closed."""
+    from zstate.cameras import CameraPublisher, SimulatedCamera, floor_surface, robot_surfaces, wall_surface
+    from zstate.nodes.static_publisher import StaticPublisher
+    from zstate.scans.simulated_laser import OCCUPIED_FROM
+
+    with ExitStack() as opening:
+        statics = StaticPublisher(session, robot, "camera", program="rover-camera")
+        opening.enter_context(statics).set(_camera_mount())
+        lens = _lens()
+        surfaces = robot_surfaces(model) | {_FLOOR: floor_surface((-5.0, 5.0), (-5.0, 5.0))}
+        if room is not None:
+            walls = wall_surface(room.cells >= OCCUPIED_FROM, room.resolution, room.planar_origin())
+            surfaces[_WALLS] = walls
+        source = _RoverCamera(SimulatedCamera(lens, surfaces), rover, model)
+        publisher = CameraPublisher(session, robot, ROVER_CAMERA, lens, program="rover-camera")
+        opening.enter_context(publisher)
+        _in_thread("rover camera", partial(publisher.run, source, _CAMERA_HZ))
+        return opening.pop_all()
+
+
+class _RoverCamera:
+    """A PictureSource: what the camera sees from where the rover truly is."""
+
+    def __init__(self, camera: SimulatedCamera, rover: SimulatedRover, model: RobotModel) -> None:
+        from zstate.model.kinematics import Kinematics
+
+        self._camera, self._rover, self._links = camera, rover, model.links
+        self._kinematics = Kinematics(model)
+        self._base_from_lens = _mounts(model)[_MAST] @ _camera_mount()
+
+    def read(self, stamp: int) -> StampedPicture | None:
+        """The picture at the last step before ``stamp`` [ns]; None right after a pause."""
+        from zstate.cameras import StampedPicture
+        from zstate.transform import Transform
+
+        joints = self._rover.joints(stamp)
+        assert joints.stamp is not None
+        if not self._rover.has_poses_since(joints.stamp):
+            return None
+        ((x, y, yaw),) = self._rover.poses([joints.stamp]).tolist()
+        world_from_base = Transform.from_rpy(_WORLD, ROVER_BASE, (x, y, 0.0), (0.0, 0.0, yaw))
+        lens_from_base = self._base_from_lens.inverse()
+        poses: dict[str, NDArray[np.float64]] = {
+            link: (lens_from_base @ Transform.from_pose7(ROVER_BASE, "link", pose)).pose7
+            for link, pose in zip(self._links, self._kinematics.link_poses(joints.positions), strict=True)
+        }
+        poses[_FLOOR] = poses[_WALLS] = (lens_from_base @ world_from_base.inverse()).pose7
+        return StampedPicture(joints.stamp, self._camera.picture(poses))
 
 
 class _Autopilot:

@@ -54,7 +54,7 @@ class ProposedWheels(NamedTuple):
 class _Wheel(NamedTuple):
     joint: Joint
     place: Floats
-    """Of its middle in the base, (3,) [m]."""
+    """The position of its middle in the base, (3,) [m]."""
     is_backwards: bool
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -42,7 +43,7 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
 
 @click.command("export")
 @click.argument("file", metavar="RECORDING")
-@click.argument("robot", required=False)
+@click.argument("rest", nargs=-1, metavar="[RECORDING]... [ROBOT]")
 @click.option(
     "--pose",
     "poses",
@@ -64,10 +65,20 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
 @click.option(
     "--stream",
     metavar="NAME",
-    help="Instead: the messages of a stream of measurements of another package, one row each.",
+    help="Instead: the messages of a stream of measurements, one row each; of clouds a row for each point.",
 )
 @click.option("--csv", "kind", flag_value="csv", help="Write comma-separated values.")
 @click.option("--parquet", "kind", flag_value="parquet", help="Write Parquet.")
+@click.option("--ply", "kind", flag_value="ply", help="Write each cloud of --stream as PLY, into a folder.")
+@click.option(
+    "--lerobot",
+    metavar="DIR",
+    help="Instead: pictures and joint states of one or more RECORDINGs as a LeRobotDataset, each an episode.",
+)
+@click.option(
+    "--fps", type=click.IntRange(min=1), metavar="N", help="With --lerobot: rows a second; default: 30."
+)
+@click.option("--task", metavar="TEXT", help="With --lerobot: what the robot does.")
 @click.option(
     "--output",
     metavar="FILE",
@@ -77,12 +88,15 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
 def export_command(
     *,
     file: str,
-    robot: str | None,
+    rest: tuple[str, ...],
     poses: tuple[tuple[str, str], ...],
     rate: float | None,
     stamps: NDArray[np.int64] | None,
     stream: str | None,
-    kind: TableFormat | None,
+    kind: TableFormat | Literal["ply"] | None,
+    lerobot: str | None,
+    fps: int | None,
+    task: str | None,
     output: str | None,
     overwrite: bool,
 ) -> None:
@@ -100,12 +114,32 @@ def export_command(
     JSON; of ROBOT, by default of all robots. The package that brings the stream must be installed here.
     The default format is then --csv.
 
+    With --lerobot, rows are --fps a second: the joint positions interpolated at each instant, and the
+    picture of each camera that is nearest to it. ROBOT is then the last argument that is no file.
+    lerobot opens the folder DIR. Needs pip install 'zstate[cameras,export]'.
+
     \b
     zstate export run.mcap --parquet                         # run.parquet
     zstate export run.mcap panda --csv --rate 50 --pose panda_link0 panda_hand
     zstate export run.mcap --parquet --stamps images.txt --output images.parquet
     zstate export run.mcap --stream battery                  # run.battery.csv
+    zstate export run.mcap --stream cloud --parquet          # run.cloud.parquet, a row for each point
+    zstate export run.mcap --stream cloud --ply              # run.cloud.ply/diffbot.lidar.STAMP.ply
+    zstate export ep1.mcap ep2.mcap --lerobot stack --task "stack the cubes"
     """
+    if lerobot is not None:
+        if poses or rate is not None or stamps is not None or stream or kind or output:
+            raise click.UsageError(
+                "--lerobot writes a folder of its own, without --pose, --rate, --stamps, --stream, --output "
+                "and the other formats"
+            )
+        _export_lerobot((file, *rest), lerobot, fps or 30, task or "", overwrite=overwrite)
+        return
+    if fps is not None or task is not None:
+        raise click.UsageError("--fps and --task are those of a dataset: name its folder with --lerobot DIR")
+    if len(rest) > 1:
+        raise click.UsageError(f"one RECORDING makes one file; got also {', '.join(rest[:-1])}")
+    robot = rest[0] if rest else None
     if stream is not None:
         if poses or rate is not None or stamps is not None:
             raise click.UsageError(
@@ -115,6 +149,8 @@ def export_command(
         return
     if kind is None:
         raise click.UsageError("Missing option '--csv' or '--parquet'.")
+    if kind == "ply":
+        raise click.UsageError("--ply writes points: name their stream, such as --stream cloud")
     if rate is not None and stamps is not None:
         raise click.UsageError("--rate and --stamps exclude each other: both choose the rows")
     from zstate.errors import RecordingError
@@ -135,22 +171,63 @@ def export_command(
 
 
 def _export_stream(
-    file: str, robot: str | None, stream: str, kind: TableFormat, output: str | None, *, overwrite: bool
+    file: str,
+    robot: str | None,
+    stream: str,
+    kind: TableFormat | Literal["ply"],
+    output: str | None,
+    *,
+    overwrite: bool,
 ) -> None:
     from zstate.errors import RecordingError
+    from zstate.plugins import stream_named
     from zstate.recording.recording import Recording
-    from zstate.recording.stream_export import export_stream
+    from zstate.recording.stream_export import export_points, export_stream
 
     path = Path(output) if output else Path(file).with_suffix(f".{stream}.{kind}")
     with Recording(file, robot) as recording:
         try:
-            rows, refused = export_stream(recording, stream, path, kind, overwrite=overwrite)
+            if kind == "ply":
+                count, refused = export_points(recording, stream, path, overwrite=overwrite)
+            else:
+                count, refused = export_stream(recording, stream, path, kind, overwrite=overwrite)
         except RecordingError as error:
             fail(str(error).replace("overwrite=True", "--overwrite"))
+    items = count_text(
+        count, "file" if kind == "ply" else "row" if stream_named(stream).columns else "message"
+    )
+    files = [*path.iterdir()] if kind == "ply" else [path]
     losses = ", ".join(f"{count_text(count, 'message')} left out ({why})" for why, count in refused.items())
-    where = f"{path} ({size_text(path.stat().st_size)})"
+    where = f"{path} ({size_text(sum(one.stat().st_size for one in files))})"
+    print_wrapped(f"exported {items} of {stream} into {where}; {losses or 'nothing missing'}")
+
+
+def _export_lerobot(names: Sequence[str], folder: str, fps: int, task: str, *, overwrite: bool) -> None:
+    from zstate.errors import RecordingError
+    from zstate.recording.lerobot import export_lerobot
+
+    *others, last = names
+    robot = last if others and not Path(last).exists() else None
+    paths = [Path(name) for name in (others if robot else names)]
+    start = time.monotonic()
+    try:
+        report = export_lerobot(
+            *(paths, Path(folder), robot),
+            fps=fps,
+            task=task,
+            overwrite=overwrite,
+            on_progress=print_status,
+        )
+    except RecordingError as error:
+        fail(str(error).replace("overwrite=True", "--overwrite"))
+    size = sum(one.stat().st_size for one in Path(folder).rglob("*") if one.is_file())
+    cameras = ", ".join(f"{name} ({width} x {height})" for name, (width, height) in report.cameras.items())
+    losses = [f"{count_text(count, 'message')} left out ({why})" for why, count in report.refused.items()]
     print_wrapped(
-        f"exported {count_text(rows, 'message')} of {stream} into {where}; {losses or 'nothing missing'}"
+        f"exported {count_text(report.episodes, 'episode')} with {count_text(report.rows, 'row')} of "
+        f"{report.robot} at {fps} fps in {time.monotonic() - start:.1f} s into {folder} ({size_text(size)}): "
+        f"{count_text(report.joint_count, 'joint')}, pictures of {cameras}, at most "
+        f"{report.farthest_ns * 1e-6:.1f} ms from their rows; {', '.join(losses) or 'nothing missing'}"
     )
 
 

@@ -104,9 +104,9 @@ def record_command(
     a map at its start and when it changes. After a crash all but the last 0.5 s is in the file; `zstate
     recover` makes a complete file of it.
 
-    Of drivers it keeps the commands, as joint states on /joint_commands; the states with motions and their
-    outcomes on /diagnostics, which Foxglove and rqt show; and the stops on /stops. A replay never publishes
-    these.
+    It keeps the commands to drivers, as joint states on /joint_commands; the states of drivers, with motions
+    and their outcomes, on /diagnostics, which Foxglove and rqt show; and the stops on /stops. A replay never
+    publishes these.
 
     FILE may have the start time in its name: %Y %m %d %H %M %S are replaced by the local time (also %y and
     %j; %% is a percent sign). The default, rec-%Y%m%d-%H%M%S.mcap in the working directory, gives each start
@@ -361,4 +361,6 @@ def _lost(stats: RecorderStats) -> str:
         (stats.unwritten, "without a description that fits"),
         (sum(stats.refused.values()), f"refused ({reasons})"),
     )
-    return ", ".join(f"{count} {what}" for count, what in parts if count)
+    lost = ", ".join(f"{count} {what}" for count, what in parts if count)
+    of = ", ".join(f"{count} of {robot} {stream}" for (robot, stream), count in sorted(stats.missing.items()))
+    return f"{lost} ({of})" if of else lost

@@ -28,7 +28,7 @@ LIBRARY = f"zstate {version('zstate')}"
 MIN_BYTES = 1 << 16
 MIN_SECONDS = 1.0
 MAX_CHANNELS = 60_000
-"""Of one file; MCAP numbers channels in 16 bits."""
+"""The most channels of one file; MCAP numbers them in 16 bits."""
 
 GROUP_NS = 10_000_000_000
 """Interval at which latched messages are repeated [ns of log time]."""

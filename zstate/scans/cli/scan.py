@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _RATE_HZ = 30.0
 _RAYS_PER_TURN = 1440
-"""Of a scanner with a ray every 0.25 degrees, which turns once per scan."""
+"""For a scanner with a ray every 0.25 degrees, which turns once per scan."""
 
 
 class _ScanCommand(click.Command):

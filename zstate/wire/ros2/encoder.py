@@ -96,11 +96,11 @@ class RosStreamEncoder:
             return self._encode_joints(message)
         if (encode := ros_encoder(type(message))) is not None:
             if isinstance(message, StampedMessage):
-                _checked_stamp(message.stamp)
+                checked_stamp(message.stamp)
             return encode(message, self._names)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
-            return self._encode_edges(edges, _checked_stamp(message.stamp), message.poses)
+            return self._encode_edges(edges, checked_stamp(message.stamp), message.poses)
         if isinstance(message, StaticTransforms):
             return self._encode_edges(message.edges, 0, message.poses)
         if isinstance(message, RobotDescription):
@@ -116,7 +116,7 @@ class RosStreamEncoder:
         velocities, efforts = state.velocities, state.efforts
         if len(self._sample_names.velocity_slots) != len(names):
             velocities, efforts = self._spread(velocities, len(names)), self._spread(efforts, len(names))
-        return self._joints[1].encode(_checked_stamp(state.stamp), state.positions, velocities, efforts)
+        return self._joints[1].encode(checked_stamp(state.stamp), state.positions, velocities, efforts)
 
     def _spread(self, block: bytes | None, count: int) -> bytes | None:
         """Each number at the index of its coordinate: in ROS there are as many velocities as positions."""
@@ -133,7 +133,8 @@ class RosStreamEncoder:
         return self._edges[1].encode(stamp, poses)
 
 
-def _checked_stamp(stamp: int) -> int:
+def checked_stamp(stamp: int) -> int:
+    """``stamp`` [ns]. Raises InvalidInput for 0."""
     if not stamp:
         raise InvalidInput("the stamp is 0, which means no stamp in ROS; give the time of the sample")
     return stamp

@@ -1,6 +1,6 @@
 """How ROS 2 carries the streams: the type and the QoS of their topics, as ``Stream.ros`` names them.
 
-Those of plugins are in their folders, beside the functions that encode and decode their messages.
+Those of plugins are in their folders, next to the functions that encode and decode their messages.
 """
 
 from __future__ import annotations
@@ -17,6 +17,20 @@ from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
 
 
+class DisplayedForm(NamedTuple):
+    """The form of those messages of a stream that viewers do not display as ROS carries them.
+
+    ``applies(message)`` says which these are. ``type``, ``suffix``, ``encode`` and ``decode`` are as in
+    RosStream. Without ``decode`` recordings have ROS's form, and only viewers of live robots get this one.
+    """
+
+    type: RosType
+    suffix: str
+    applies: Callable[..., bool]
+    encode: Callable[..., bytes]
+    decode: Callable[..., Message] | None = None
+
+
 class RosStream(NamedTuple):
     """The ``type`` of a stream's topics, and the ``qos`` that its writers offer.
 
@@ -26,8 +40,10 @@ class RosStream(NamedTuple):
     in ``RosStreamEncoder`` and ``RosDecoder``. ``suffix`` are the last names of a topic below that of the
     sensor, as cameras have them: /r1/wrist/camera_info. With ``is_of_sensor`` their namespace may be that of
     the sensor: /r1/imu/data is a topic of the robot r1. ``uncarried`` is the field with a frame that ROS does
-    not carry: a recording has a channel for each. ``withdrawn`` is recorded when a latched value is
-    withdrawn, which ROS cannot express; ``is_withdrawn`` whether a message is such a one.
+    not carry: a recording has a channel for each, and for each value of ``uncarried_number``, a field with an
+    integer of a latched message. ``withdrawn`` is recorded when a latched value is
+    withdrawn, which ROS cannot express; ``is_withdrawn`` whether a message is such a one. ``displayed`` is
+    the form of some of the messages in recordings and for viewers.
     """
 
     type: RosType
@@ -38,8 +54,17 @@ class RosStream(NamedTuple):
     is_of_sensor: bool = False
     suffix: str = ""
     uncarried: str = ""
+    uncarried_number: str = ""
     withdrawn: Message | None = None
     is_withdrawn: Callable[..., bool] | None = None
+    displayed: DisplayedForm | None = None
+
+    def recorded_form(self, type_name: str) -> DisplayedForm | None:
+        """The form of recorded messages of the type ``type_name``; None for those of ``type``."""
+        form = self.displayed
+        if form is None or form.decode is None or form.type.name != type_name:
+            return None
+        return form
 
 
 class RecordedForm(NamedTuple):
@@ -124,6 +149,18 @@ def has_sensor_topics(stream: StreamName) -> bool:
     return carried is not None and carried.is_of_sensor
 
 
+def displayed_form(stream: StreamName) -> DisplayedForm | None:
+    """The form of some of the messages of ``stream`` in recordings and for viewers, if it has one."""
+    carried = ros_streams().get(stream)
+    return None if carried is None else carried.displayed
+
+
+def uncarried_number(stream: StreamName) -> str:
+    """The field with a number that ROS does not carry; empty if the messages of ``stream`` have none."""
+    carried = ros_streams().get(stream)
+    return "" if carried is None else carried.uncarried_number
+
+
 def topic_suffix(stream: StreamName) -> str:
     """What follows the name of a sensor in the topics of the stream: "/" and names, or nothing."""
     carried = ros_streams().get(stream)
@@ -133,8 +170,10 @@ def topic_suffix(stream: StreamName) -> str:
 def without_suffix(topic: str) -> str:
     """``topic`` up to the name of its sensor."""
     for stream in ros_streams():
-        if (suffix := topic_suffix(stream)) and topic.endswith(suffix):
-            return topic.removesuffix(suffix)
+        form = displayed_form(stream)
+        for suffix in (topic_suffix(stream), "" if form is None else f"/{form.suffix}"):
+            if suffix and topic.endswith(suffix):
+                return topic.removesuffix(suffix)
     return topic
 
 

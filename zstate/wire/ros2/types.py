@@ -71,6 +71,12 @@ _FIELDS: dict[str, Fields] = {
         ("string", "format"),
         ("uint8[]", "data"),
     ),
+    "foxglove_msgs/CompressedVideo": (
+        ("builtin_interfaces/Time", "timestamp"),
+        ("string", "frame_id"),
+        ("uint8[]", "data"),
+        ("string", "format"),
+    ),
     "sensor_msgs/Image": (
         ("std_msgs/Header", "header"),
         ("uint32", "height"),
@@ -247,6 +253,7 @@ STRING = RosType.from_fields("std_msgs/String")
 LASER_SCAN = RosType.from_fields("sensor_msgs/LaserScan")
 POINT_CLOUD2 = RosType.from_fields("sensor_msgs/PointCloud2")
 COMPRESSED_IMAGE = RosType.from_fields("sensor_msgs/CompressedImage")
+COMPRESSED_VIDEO = RosType.from_fields("foxglove_msgs/CompressedVideo")
 IMAGE = RosType.from_fields("sensor_msgs/Image")
 CAMERA_INFO = RosType.from_fields("sensor_msgs/CameraInfo")
 OCCUPANCY_GRID = RosType.from_fields("nav_msgs/OccupancyGrid")
