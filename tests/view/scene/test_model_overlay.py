@@ -19,7 +19,7 @@ from zstate.model.geometry import read_shapes
 from zstate.model.urdf import parse_urdf
 from zstate.transform import Transform
 from zstate.view.pictures import Packet, StillPicture
-from zstate.view.scene.model_overlay import ModelOverlay, projected
+from zstate.view.scene.model_overlay import ModelOverlay, segments_of, split
 from zstate.view.scene.robot_meshes import RobotKind
 
 S = 1_000_000_000
@@ -85,14 +85,14 @@ def test_picture_without_poses_at_its_stamp_is_left_as_it_is_with_the_reason(ove
     assert same is picture
     assert problem is not None
     assert "box/base" in problem
-    assert overlay.newest("lens", buffer) == 3 * S
 
 
 def test_robot_that_is_not_connected_to_the_camera_is_left_out(overlay, buffer):
     buffer.insert_static(Transform("hall", "other", (0.0, 0.0, 0.0), UNTURNED))
+    camera = Camera(320, 240, CAMERA.k, frame="other")
     picture = picture_at(S, frame="other")
-    assert overlay.drawn_over(picture, CAMERA, buffer) == (picture, "no robot is in it")
-    assert overlay.newest("other", buffer) is None
+    assert overlay.drawn_over(picture, camera, buffer) == (picture, "no robot is in it")
+    assert overlay.newest(camera, buffer, S) == S
 
 
 def test_broken_picture_is_left_as_it_is_with_the_reason(overlay, buffer):
@@ -110,10 +110,30 @@ def test_robot_behind_the_camera_is_not_drawn(overlay):
     assert overlay.drawn_over(picture, CAMERA, buffer) == (picture, "no robot is in it")
 
 
+def test_picture_waits_for_the_poses_of_its_rows_but_not_for_a_silent_robot(overlay, buffer):
+    rolling = Camera(320, 240, CAMERA.k, frame="lens", line_time_ns=1_000_000)
+    assert overlay.newest(CAMERA, buffer, 2 * S) == 2 * S
+    assert overlay.newest(CAMERA, buffer, 3 * S + 5) == 3 * S
+    assert overlay.newest(rolling, buffer, 3 * S) == 3 * S - 240_000_000
+    assert overlay.newest(CAMERA, buffer, 5 * S) == 5 * S
+
+
+def test_rows_of_a_rolling_shutter_have_instants_of_their_own(overlay, buffer):
+    # 4 ms a row: the bottom is taken 22 / 120 s later than the middle, and is further to the right.
+    rolling = Camera(320, 240, CAMERA.k, frame="lens", line_time_ns=4_000_000)
+    drawn = green(overlay.drawn_over(picture_at(0), rolling, buffer)[0])
+    top, bottom = (drawn[np.abs(drawn[:, 1] - row) < 3, 0].mean() for row in (119.5 - 22.2, 119.5 + 22.2))
+    assert bottom - top == pytest.approx(44.4 * 0.004 * 0.1 * 200 / 1.8, abs=1.0)
+
+
+def segments_seen(camera: Camera, *ends: tuple[float, float, float]) -> np.ndarray:
+    lines = split(np.array([ends]))
+    return segments_of(*camera.project(lines.reshape(-1, 3)), camera)
+
+
 def test_long_line_is_bent_as_the_lens_bends_it():
     camera = Camera(320, 240, (200.0, 200.0, 159.5, 119.5), (-0.3, 0.05, 0.0, 0.0))
-    line = np.array([[[-0.5, 0.5, 1.0], [0.5, 0.5, 1.0]]])
-    segments = projected(line, camera)
+    segments = segments_seen(camera, (-0.5, 0.5, 1.0), (0.5, 0.5, 1.0))
     middle, ends = camera.project([[0.0, 0.5, 1.0], [-0.5, 0.5, 1.0]])[0][:, 1]
     assert middle - ends > 5.0  # pixels
     rows = segments[..., 1]
@@ -122,7 +142,6 @@ def test_long_line_is_bent_as_the_lens_bends_it():
 
 
 def test_line_from_behind_the_camera_is_drawn_as_far_as_it_is_seen():
-    line = np.array([[[0.1, 0.0, -1.0], [0.1, 0.0, 3.0]]])
-    segments = projected(line, CAMERA)
+    segments = segments_seen(CAMERA, (0.1, 0.0, -1.0), (0.1, 0.0, 3.0))
     assert len(segments) > 0
     assert np.isfinite(segments).all()

@@ -102,11 +102,11 @@ class Cameras:
                 self._cameras[name] = _CameraNode(f"/cameras/{self._count}")
                 self._count += 1
             node = self._cameras[name]
-            packets = last_packets(sensor, self._until(sensor, buffer, at))
+            camera = cameras.get(name)
+            packets = last_packets(sensor, self._until(sensor, camera, buffer, at))
             picture, problem = node.reader.read(packets), node.reader.problem
             if picture is None:
                 continue
-            camera = cameras.get(name)
             if camera is not None and picture.size != (camera.width, camera.height):
                 camera = None
             is_old, model_problem = sensor.is_stale(at) or problem is not None, None
@@ -115,13 +115,14 @@ class Cameras:
             shown[name] = ShownPicture(picture, camera, is_old, problem, model_problem)
         self.shown = shown
 
-    def _until(self, sensor: Sensor[Packet], buffer: TransformBuffer, at: int | None) -> int | None:
-        """``at``, or the newest stamp [ns] with poses, where models are drawn over the pictures."""
-        newest = sensor.latest(1, at)
-        if not self.models or not newest:
+    def _until(
+        self, sensor: Sensor[Packet], camera: Camera | None, buffer: TransformBuffer, at: int | None
+    ) -> int | None:
+        """``at``, or an earlier stamp [ns] with poses if models are drawn over the pictures."""
+        newest = sensor.latest(1, at) if self.models else ()
+        if not newest or camera is None:
             return at
-        known = self._overlay.newest(newest[0].frame, buffer)
-        return at if known is None else known if at is None else min(at, known)
+        return self._overlay.newest(camera, buffer, newest[0].stamp)
 
 
 def last_packets(sensor: Sensor[Packet], at: int | None) -> Sequence[Packet]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +25,13 @@ _COLOR = 60, 255, 90
 _QUALITY = 85
 _LONG_M, _PARTS = 0.1, 8
 """Longer lines are drawn in parts: a lens bends them, and they may begin behind the camera."""
+_SILENT_NS = 1_000_000_000
 _APART = UnknownFrame, AmbiguousFrame, Disconnected
 """Why a link has no place in the frame of a camera, at any instant."""
 
 Segments = NDArray[np.float64]
 
-_NO_LINES: Lines = np.empty((0, 2, 3))
+_NO_SEGMENTS: Segments = np.empty((0, 2, 2))
 
 
 class ModelOverlay:
@@ -46,15 +48,18 @@ class ModelOverlay:
             if robot not in self._edges or self._edges[robot].kind != kind:
                 self._edges[robot] = RobotEdges(kind)
 
-    def newest(self, frame: str, buffer: TransformBuffer) -> int | None:
-        """The newest stamp [ns] at which all links have a pose in ``frame``; None if none of them moves."""
-        stamps: list[int] = []
+    def newest(self, camera: Camera, buffer: TransformBuffer, stamp: int) -> int:
+        """``stamp`` of a picture [ns], or an earlier one for all of whose rows the links have poses by now.
+
+        A robot that is silent, for a second, has none, and is not waited for.
+        """
+        shutter = camera.line_time_ns * camera.height
+        newest = stamp
         for link, _ in self._links():
-            try:
-                stamps.append(buffer.latest(frame, link))
-            except LookupFailed:
-                continue
-        return min(stamps, default=None)
+            with suppress(LookupFailed):
+                known = buffer.latest(camera.frame, link) - shutter
+                newest = min(newest, known) if known > stamp - _SILENT_NS else newest
+        return newest
 
     def drawn_over(
         self, picture: StillPicture, camera: Camera, buffer: TransformBuffer
@@ -62,19 +67,18 @@ class ModelOverlay:
         """``picture`` with the models at its stamp; and why they are not all in it, None if they are."""
         if not all(edges.is_loaded for edges in self._edges.values()):
             return picture, "the meshes are being read"
-        found: list[Lines] = []
+        stamp, found = picture.packet.stamp, [_NO_SEGMENTS]
         reason: str | None = None
         for link, edges in self._links():
             try:
-                camera_from_link = buffer.lookup(picture.packet.frame, link, picture.packet.stamp)
+                eye = buffer.lookup(link, camera.frame, stamp).translation
+                points = split(edges.seen_from(eye)).reshape(-1, 3)
+                found.append(segments_of(*buffer.project(points, link, camera, stamp), camera))
             except _APART:
                 continue
             except LookupFailed as error:
                 reason = str(error)
-                continue
-            lines = edges.seen_from(camera_from_link.inverse().translation)
-            found.append((camera_from_link @ lines.reshape(-1, 3)).reshape(-1, 2, 3))
-        segments = projected(np.concatenate([_NO_LINES, *found]), camera)
+        segments = np.concatenate(found)
         if not len(segments):
             return picture, reason or "no robot is in it"
         try:
@@ -87,23 +91,19 @@ class ModelOverlay:
             yield from ((f"{robot}/{link}", its) for link, its in edges.links.items())
 
 
-def projected(lines: Lines, camera: Camera) -> Segments:
-    """The lines (N, 2, 3) [m] in the frame of ``camera`` in its picture: (M, 2, 2) u v of both ends [px].
-
-    Without those that are outside of the picture, or behind the camera.
-    """
+def split(lines: Lines) -> Lines:
+    """The lines (N, 2, 3) [m], long ones in parts: (M, 2, 3)."""
     is_long = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) > _LONG_M
-    split = [_split(lines[~is_long], 1), _split(lines[is_long], _PARTS)]
-    pixels, valid = camera.project(np.concatenate(split).reshape(-1, 3))
+    shares = np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
+    points = lines[is_long, None, 0] * (1.0 - shares) + lines[is_long, None, 1] * shares
+    parts = np.stack([points[:, :-1], points[:, 1:]], axis=2)
+    return np.concatenate([lines[~is_long], parts.reshape(-1, 2, 3)])
+
+
+def segments_of(pixels: NDArray[np.float64], valid: NDArray[np.bool_], camera: Camera) -> Segments:
+    """The lines between pairs of ``pixels`` (2 N, 2): (M, 2, 2), those that are valid and in the picture."""
     segments = pixels.reshape(-1, 2, 2)[valid.reshape(-1, 2).all(axis=1)]
     return segments[camera.contains(segments.reshape(-1, 2)).reshape(-1, 2).any(axis=1)]
-
-
-def _split(lines: Lines, parts: int) -> Lines:
-    """Each of the lines (N, 2, 3) in ``parts``: (N * parts, 2, 3)."""
-    shares = np.linspace(0.0, 1.0, parts + 1)[:, None]
-    points = lines[:, None, 0] * (1.0 - shares) + lines[:, None, 1] * shares
-    return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
 def _with_segments(picture: StillPicture, segments: Segments) -> StillPicture:
