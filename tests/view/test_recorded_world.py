@@ -1,20 +1,28 @@
-"""RecordedWorld: the scans and maps of a recording at any instant of it, read from the file when needed."""
+"""RecordedWorld: the scans, clouds and maps of a recording at any instant, read from the file when needed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.pictures import jpeg
 from helpers.recording_builder import MS, START, RecordingBuilder, S, pose
 
+from zstate.cameras import Camera
+from zstate.cameras.camera import camera_to_message
+from zstate.cameras.messages import CompressedImage
+from zstate.clouds.cloud import Cloud, cloud_to_message
+from zstate.clouds.messages import PointCloud
 from zstate.scans import Scan
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.data_source import ViewSource
-from zstate.view.recorded_world import LogTimes, RecordedMap, RecordedScans
+from zstate.view.recorded_world import LogTimes, RecordedSensor, RecordedValue
 from zstate.view.world_source import WriterName
 from zstate.wire.messages import to_block, to_float32_block
 
 FRONT, FLOOR = WriterName("cart", "front"), WriterName("hall", "floor")
+TOP, WRIST = WriterName("cart", "top"), WriterName("cart", "wrist")
 RAY_NS = 1000
 COUNT = 100
 """Scans of each sensor, 100 ms apart: more than are read together."""
@@ -105,7 +113,7 @@ def test_scan_whose_last_ray_has_no_pose_is_reported(source: ViewSource):
     assert sensor.problem is None
     sensor.settle(source.buffer, "elsewhere", begin + S)
     assert sensor.problem is not None
-    assert sensor.problem.startswith("rays without a pose: ")
+    assert sensor.problem.startswith("points without a pose: ")
     assert "elsewhere" in sensor.problem
 
 
@@ -126,15 +134,79 @@ def test_recorded_scans_without_motion_have_a_span(tmp_path: Path):
         assert firsts(source, 1, end_of(START + S)) == [2.0]
 
 
-def indexed(*stamps: int) -> RecordedScans:
+def cloud_message(stamp: int, count: int, first: float) -> PointCloud:
+    """Points on the x axis, from ``first`` on."""
+    points = np.zeros(count, [(name, "<f4") for name in "xyz"])
+    points["x"] = first + np.arange(count)
+    return cloud_to_message(Cloud(stamp, "lidar", points), is_dense=True)
+
+
+@pytest.fixture
+def with_clouds(tmp_path: Path):
+    """Three seconds of a cart with a lidar of 10 Hz and 50 points."""
+    path = tmp_path / "clouds.mcap"
+    with RecordingBuilder(path) as builder:
+        for n in range(31):
+            stamp = START + n * 100 * MS
+            builder.edges("cart", stamp, {("odom", "lidar"): pose(n)})
+            builder.encoder.write_message("cart", cloud_message(stamp, 50, n), stamp + MS, "top")
+    with ViewSource.from_recording(path) as source:
+        yield source
+
+
+def test_recorded_clouds_of_the_last_seconds_are_read_in_any_order(with_clouds: ViewSource):
+    sensor = with_clouds.world.clouds[TOP]
+    for n in (0, 7, 8, 30, 3):
+        found = sensor.within(500 * MS, START + n * 100 * MS)
+        assert [cloud.xyz[0, 0] for cloud in found] == list(range(max(0, n - 5), n + 1))
+    assert sensor.frame == "cart/lidar"
+    assert with_clouds.world.span == (START, START + 3 * S)
+
+
+def test_recorded_clouds_are_read_again_for_more_points(with_clouds: ViewSource):
+    def counts() -> list[int]:
+        return [len(cloud) for cloud in with_clouds.world.clouds[TOP].within(200 * MS, START + S)]
+
+    world = with_clouds.world
+    world.limit_clouds(TOP, 10)
+    assert counts() == [10, 10, 10]
+    world.limit_clouds(TOP, 40)
+    assert counts() == [40, 40, 40]
+
+
+def test_recorded_pictures_and_calibrations_are_those_of_the_instant(tmp_path: Path):
+    path = tmp_path / "pictures.mcap"
+    camera, small = (Camera(w, 48, (60.0, 60.0, 31.5, 23.5), frame="lens") for w in (64, 80))
+    with RecordingBuilder(path) as builder:
+        builder.encoder.write_message("cart", camera_to_message(camera, START), START, "wrist")
+        for n in range(20):
+            stamp = START + n * 100 * MS
+            builder.edges("cart", stamp, {("base", "lens"): pose(n)})
+            image = CompressedImage(stamp, n, 1, "lens", "jpeg", jpeg(brightness=5 * n))
+            builder.encoder.write_message("cart", image, stamp + MS, "wrist")
+            if n == 10:
+                builder.encoder.write_message(
+                    "cart", camera_to_message(small, stamp), stamp + 2 * MS, "wrist"
+                )
+    with ViewSource.from_recording(path) as source:
+        world = source.world
+        for n in (3, 19, 0, 12):
+            at = START + n * 100 * MS
+            (packet,) = world.pictures[WRIST].latest(1, at)
+            assert packet.data == jpeg(brightness=5 * n)
+            assert packet.frame == "cart/lens"
+            assert world.cameras_at(at + 50 * MS)[WRIST].width == (64 if n < 10 else 80)
+
+
+def indexed(*stamps: int) -> RecordedSensor:
     scans = [Scan(stamp, 0.0, 0.5, 0, [1.0], 0.1, 10.0, "laser") for stamp in stamps]
-    recorded = RecordedScans(lambda begin, end: iter(scans[begin:end]))
+    recorded = RecordedSensor(lambda begin, end: iter(scans[begin:end]))
     for number, one in enumerate(scans):
         recorded.add(one, number)
     return recorded
 
 
-def stamps_of(recorded: RecordedScans, at: int | None = None) -> list[int]:
+def stamps_of(recorded: RecordedSensor, at: int | None = None) -> list[int]:
     return [scan.stamp for scan in recorded.latest(9, at)]
 
 
@@ -170,7 +242,7 @@ def test_log_time_is_interpolated_and_begins_again_with_the_clock():
 
 def test_map_is_read_once_while_it_is_in_effect():
     reads: list[int] = []
-    recorded = RecordedMap(reads.append)
+    recorded = RecordedValue(reads.append)
     for log_time, is_withdrawn in ((10, False), (20, True), (30, False)):
         recorded.add(log_time, is_withdrawn=is_withdrawn)
     for log_time in (5, 10, 19, 20, 29, 30, 99, None, 15):

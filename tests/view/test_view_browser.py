@@ -12,7 +12,9 @@ import pytest
 from helpers.processes import DEADLINE_S, repeated, until
 from numpy.typing import NDArray
 
-from zstate import StatePublisher, Transform, load_model
+from zstate import StatePublisher, StaticPublisher, Transform, load_model
+from zstate.cameras import Camera, CameraPublisher
+from zstate.clouds import CloudPublisher
 from zstate.model.geometry import read_shapes
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
@@ -306,6 +308,84 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         view_tab.save_screenshot("map")
         for place in (unknown, free):
             assert min(lightness(place)) > 180
+
+
+def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_view, sessions):
+    # A wall of points a millimetre apart, 0.2 x 0.2 m, beside the arm.
+    across, up = np.meshgrid(np.linspace(0.5, 0.7, 200), np.linspace(0.5, 0.7, 200))
+    points = np.stack([np.zeros(across.size), across.ravel(), up.ravel()], axis=1)
+    middle = np.array([[0.0, 0.6, 0.6]])
+    with (
+        standing(sessions[0], "rrbot"),
+        CloudPublisher(sessions[0], "rrbot", "lidar", frame="world") as lidar,
+        repeated(lambda: lidar.publish(points), every_s=0.1),
+    ):
+        shown = show_view(sessions[1], "rrbot")
+        clouds = shown.view.scene.clouds
+        until(lambda: "rrbot" in shown.source.models and clouds.has_any)
+        view_tab = open_tab(shown.page.url)
+        until_fitted(shown)
+        snapshot = shown.source.snapshot()
+        placed = snapshot.poses_in("rrbot/world")
+        framing = fit_camera(snapshot, placed, 1.0, shown.view.scene.corners(snapshot.tree, placed))
+        assert framing is not None
+        height, width = shape_of(view_tab)
+        ((x, y),) = pixels_of(middle, framing, (width, height)).round().astype(int).tolist()
+
+        def is_drawn() -> bool:
+            pixel = view_tab.pixels()[y, x].astype(int)
+            return pixel.max() - pixel.min() > 60  # coloured
+
+        until(is_drawn, PATIENCE_S)
+        view_tab.save_screenshot("cloud")
+        field(view_tab, "Draw clouds").click()
+        until(lambda: not clouds.is_on)
+        until(lambda: not is_drawn(), PATIENCE_S)
+
+
+def test_picture_is_shown_in_the_tab_and_on_the_frustum(open_tab, show_view, sessions):
+    # A red picture of a camera beside the arm, which looks at it along -y of the world.
+    red = np.tile(np.array([200, 20, 20], np.uint8), (48, 64, 1))
+    camera = Camera(64, 48, (60.0, 60.0, 31.5, 23.5), frame="lens")
+    turn = (0.0, math.sqrt(0.5), -math.sqrt(0.5), 0.0)
+    with (
+        standing(sessions[0], "rrbot"),
+        StaticPublisher(sessions[0], "rrbot", "mount") as mount,
+        CameraPublisher(sessions[0], "rrbot", "wrist", camera) as publisher,
+        repeated(lambda: publisher.publish(red), every_s=0.1),
+    ):
+        mount.set(Transform("world", "lens", (0.0, 3.0, 1.0), turn))
+        shown = show_view(sessions[1], "rrbot")
+        until(lambda: "rrbot" in shown.source.models and shown.view.scene.cameras.shown)
+        view_tab = open_tab(shown.page.url)
+        until_fitted(shown)
+        height, width = shape_of(view_tab)
+
+        def red_parts() -> tuple[bool, bool]:
+            """Whether there is red in the scene, and in the panels."""
+            pixels = view_tab.pixels().astype(int)
+            is_red = (pixels[:, :, 0] > 150) & (pixels[:, :, 1:].max(axis=2) < 60)
+            return is_red[:height, : width - 20].sum() > 200, is_red[:, width:].sum() > 2000
+
+        view_tab.text("Cameras", exact=True).click()
+        until(lambda: all(red_parts()), PATIENCE_S)
+        view_tab.text("64 x 48 jpeg")
+        view_tab.save_screenshot("picture")
+
+        # The outline of the arm, which the camera sees, is green.
+        def has_green() -> bool:
+            red, green, blue = np.moveaxis(view_tab.pixels().astype(int)[150:, width:], -1, 0)
+            return (green - np.maximum(red, blue) > 40).sum() > 30
+
+        assert not has_green()
+        field(view_tab, "Model over picture").click()
+        until(lambda: shown.view.scene.cameras.models)
+        until(has_green, PATIENCE_S)
+        view_tab.save_screenshot("picture_model")
+        field(view_tab, "Model over picture").click()
+        field(view_tab, "Frustums").click()
+        until(lambda: not shown.view.scene.cameras.frustums)
+        until(lambda: red_parts() == (False, True), PATIENCE_S)
 
 
 def test_map_without_any_frame_is_drawn_in_its_own(open_tab, show_view, sessions):

@@ -1,15 +1,19 @@
-"""SensorScans and WorldSource: what of the network's scans and maps is kept, and what is dropped."""
+"""LiveSensor and WorldSource: what of the network's scans, clouds and maps is kept, and what is dropped."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.cameras import Camera
+from zstate.cameras.camera import camera_to_message
+from zstate.clouds.cloud import Cloud, cloud_to_message
 from zstate.net.subscription import Received
 from zstate.scans import Scan
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
-from zstate.view.world_source import SensorScans, WorldSource, WriterName
+from zstate.view.world_source import LiveSensor, WorldSource, WriterName
 from zstate.wire.messages import to_block, to_float32_block
 
 MS = 1_000_000
@@ -45,7 +49,7 @@ def scan_at(stamp: int, rays: int = 1) -> Scan:
 
 
 def test_reason_of_a_dropped_scan_stays_while_a_newer_one_waits(clock: ManualClock, buffer: TransformBuffer):
-    sensor = SensorScans(clock=clock)
+    sensor = LiveSensor(clock=clock)
     sensor.add(scan_at(20 * MS))  # after the last pose
     clock.now_s += 2.0
     sensor.add(scan_at(21 * MS))
@@ -60,7 +64,7 @@ def test_reason_of_a_dropped_scan_stays_while_a_newer_one_waits(clock: ManualClo
 
 
 def test_kept_scans_are_bounded_by_number_and_by_rays(buffer: TransformBuffer):
-    few_rays, many_rays = SensorScans(), SensorScans()
+    few_rays, many_rays = LiveSensor(), LiveSensor()
     for _ in range(1100):
         few_rays.add(scan_at(5 * MS))
         few_rays.settle(buffer, "odom")
@@ -72,7 +76,7 @@ def test_kept_scans_are_bounded_by_number_and_by_rays(buffer: TransformBuffer):
 
 
 def test_waiting_scans_are_bounded_by_bytes(buffer: TransformBuffer):
-    sensor = SensorScans()
+    sensor = LiveSensor()
     for _ in range(5):
         sensor.add(scan_at(5 * MS, 300_000))
     sensor.settle(buffer, "odom")
@@ -82,7 +86,7 @@ def test_waiting_scans_are_bounded_by_bytes(buffer: TransformBuffer):
 def test_scans_that_overflow_the_queue_are_counted_with_the_reason(
     clock: ManualClock, buffer: TransformBuffer
 ):
-    sensor = SensorScans(clock=clock)
+    sensor = LiveSensor(clock=clock)
     for _ in range(300):
         sensor.add(scan_at(20 * MS))  # waits for its pose
     sensor.settle(buffer, "odom")
@@ -93,7 +97,7 @@ def test_scans_that_overflow_the_queue_are_counted_with_the_reason(
 class ReceivingBuffer(TransformBuffer):
     """A buffer whose first lookup of a scan is overtaken by 256 further scans."""
 
-    sensor: SensorScans | None = None
+    sensor: LiveSensor | None = None
 
     def explain(self, *args, **options):
         sensor, self.sensor = self.sensor, None
@@ -104,7 +108,7 @@ class ReceivingBuffer(TransformBuffer):
 
 
 def test_scans_that_arrive_during_a_lookup_are_all_kept_or_counted():
-    buffer, sensor = ReceivingBuffer(history_s=3600.0), SensorScans()
+    buffer, sensor = ReceivingBuffer(history_s=3600.0), LiveSensor()
     for stamp in (0, 10 * MS):
         buffer.insert(Transform("odom", "r1/laser", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp=stamp))
     sensor.add(scan_at(4 * MS))
@@ -159,3 +163,42 @@ def test_map_beyond_the_limit_is_reported_with_what_to_do():
         assert "`zstate ls`" in why
         source._on_maps(received[:64])  # maps that are drawn may change
         assert source.refused == {"too many maps": 1}
+
+
+def test_cloud_is_thinned_out_to_the_limit_of_its_sensor():
+    points = np.zeros(500, [(name, "<f4") for name in "xyz"])
+    message = cloud_to_message(Cloud(5 * MS, "lidar", points), is_dense=True)
+    with WorldSource(None) as source:
+        source.limit_clouds(WriterName("r1", "top"), 20)
+        source._on_clouds([Received("r1", f"zstate/r1/cloud/{name}", message) for name in ("top", "front")])
+        buffer = TransformBuffer()
+        buffer.insert_static(Transform("odom", "r1/lidar", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+        counts = {}
+        for name, sensor in source.clouds.items():
+            sensor.settle(buffer, "odom")
+            counts[name.name] = [len(cloud) for cloud in sensor.within(0)]
+        assert counts == {"top": [20], "front": [500]}
+
+
+def test_cloud_with_impossible_times_is_refused():
+    points = np.zeros(1, [*((name, "<f4") for name in "xyz"), ("timestamp", "<f8")])
+    points["timestamp"] = 1e300
+    message = cloud_to_message(Cloud(5 * MS, "lidar", points), is_dense=True)
+    with WorldSource(None) as source:
+        source._on_clouds([Received("r1", "zstate/r1/cloud/top", message)])
+        assert (dict(source.clouds), source.refused) == ({}, {"malformed cloud": 1})
+
+
+def test_calibration_of_a_camera_replaces_the_one_before_and_is_withdrawn():
+    key = "zstate/r1/camera_info/wrist"
+
+    def receive(source: WorldSource, width: int) -> None:
+        camera = Camera(width, 48, (60.0, 60.0, 31.5, 23.5))
+        source._on_cameras([Received("r1", key, camera_to_message(camera, 1))])
+
+    with WorldSource(None) as source:
+        receive(source, 64)
+        receive(source, 80)
+        assert source.cameras_at()[WriterName("r1", "wrist")].width == 80
+        source._on_camera_withdrawn(key)
+        assert source.cameras_at() == {}

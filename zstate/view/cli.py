@@ -140,8 +140,8 @@ def view_command(
     AMENT_PREFIX_PATH, and in example-robot-data. Relative paths, and packages around the URDF file, are used
     only if that file is given as ROBOT. Robots without a common frame are drawn next to each other.
 
-    Maps, and the last laser scans of each sensor, are drawn as soon as they are published; of a recording,
-    those of the instant on display.
+    Maps, and the last laser scans and clouds of each sensor, are drawn as soon as they are published; of a
+    recording, those of the instant on display.
 
     \b
     zstate view

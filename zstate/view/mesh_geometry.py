@@ -95,7 +95,7 @@ def smooth_normals(
     features: list[NDArray[Any]] = [points[rows].astype(np.float32), np.rint(facing * _STEPS)]
     features += [] if uv is None else [uv[rows].astype(np.float32)]
     features += [] if colors is None else [colors[rows]]
-    first, shared = _groups(features)
+    first, shared = groups(features)
     kept = rows[first]
     return Mesh(
         points[kept].astype(np.float32),
@@ -114,7 +114,7 @@ def _areas(points: Corners, triangles: NDArray[np.integer[Any]]) -> Corners:
 
 def _normals(corners: Corners, areas: Corners) -> Corners:
     """The normal of each corner: the mean of the triangles at its point within 35 degrees."""
-    _, places = _groups([corners.astype(np.float32)])
+    _, places = groups([corners.astype(np.float32)])
     order = np.argsort(places, kind="stable")
     counts = np.bincount(places)
     starts = np.cumsum(counts) - counts
@@ -131,7 +131,7 @@ def _normals(corners: Corners, areas: Corners) -> Corners:
     return directions(sums)
 
 
-def _groups(features: list[NDArray[Any]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def groups(features: list[NDArray[Any]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Groups of rows that are equal in all features: the first row of each, and the group of each row.
 
     Rows are compared by a 64-bit hash, because sorting rows takes ten times as long.

@@ -1,6 +1,6 @@
 """Meshes of shapes as binary glTF, from files or primitives, loaded on a background thread.
 
-The one module that uses trimesh and Pillow.
+The one module that uses trimesh.
 """
 
 from __future__ import annotations

@@ -15,5 +15,5 @@ PLUGIN = Plugin(
         "rviz": "view",
         "rviz2": "view",
     },
-    needs=("driving", "recording", "scans"),
+    needs=("cameras", "clouds", "driving", "recording", "scans"),
 )

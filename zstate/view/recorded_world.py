@@ -1,7 +1,7 @@
-"""Scans and maps to draw, from a recording.
+"""Scans, clouds, pictures and maps to draw, from a recording.
 
-Scans and maps stay in the file: a lidar writes more than all joints of a robot together. ``RecordedWorld``
-indexes them once, while the poses are loaded, and reads those around the instant on display.
+They stay in the file: a lidar writes more than all joints of a robot together. ``RecordedWorld`` indexes them
+once, while the poses are loaded, and reads those around the instant on display.
 """
 
 from __future__ import annotations
@@ -12,12 +12,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import TimeSpan
+from zstate.cameras.camera import Camera, camera_from_message
+from zstate.cameras.messages import CameraInfo, CompressedImage
+from zstate.cameras.plugin import CAMERA_INFO, IMAGE
+from zstate.clouds.cloud import Cloud, cloud_from_message
+from zstate.clouds.messages import PointCloud
+from zstate.clouds.plugin import CLOUD
 from zstate.errors import InvalidInput
 from zstate.ingest.deadline import PERIODS, is_stale
 from zstate.recording.decode import DecodedMessage, DecodedRecording, LatchedState
@@ -27,62 +34,81 @@ from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
 from zstate.streams import StreamName
-from zstate.view.world_source import TIME_JUMP_NS, WriterName
+from zstate.view.pictures import Packet, packet_from_message
+from zstate.view.thinned_cloud import ThinnedCloud, thinned_cloud
+from zstate.view.world_source import CLOUD_POINTS, TIME_JUMP_NS, M, Measured, WriterName
 from zstate.wire.messages import Message
 
-_READ_AHEAD = 30
+_SCANS_AHEAD = 30
 """Scans that are read together: a second of most sensors."""
+_FEW_AHEAD = 3
+"""Clouds and pictures that are read together: one takes milliseconds."""
 _COMPARED_NS = 1_000_000_000
 """Stamps and log times of a recording are compared so often."""
 
+V = TypeVar("V")
 
-class RecordedScans:
-    """The scans of one sensor in a recording, by the stamps of their last rays.
 
-    A scan that is not newer than the one before is left out; one that is more than a second older begins
-    again, as the poses do when a clock was set back. ``read(begin, end)`` yields the scans with log times
-    [ns] in [begin, end). ``problem`` is why the last ray of the newest scan on display has no pose, None if
-    it has one.
+class RecordedSensor(Generic[M]):
+    """The scans, clouds or pictures of one sensor in a recording, by the stamps of their ends.
+
+    One that is not newer than the one before is left out; one that is more than a second older begins again,
+    as the poses do when a clock was set back. ``read(begin, end)`` yields those with log times [ns] in
+    [begin, end), ``ahead`` more than are needed. ``problem`` is why the end of the newest one on display has
+    no pose, None if it has one.
     """
 
-    def __init__(self, read: Callable[[int, int], Iterator[Scan]]) -> None:
+    def __init__(self, read: Callable[[int, int], Iterator[M]], ahead: int = _SCANS_AHEAD) -> None:
         self.frame: str | None = None
         self.problem: str | None = None
         self._read = read
+        self._ahead = ahead
         self._ends: list[int] = []
         self._log_times: list[int] = []
-        self._loaded: dict[int, Scan] = {}
+        self._loaded: dict[int, M] = {}
         """By row of the index."""
 
-    def add(self, scan: Scan, log_time: int) -> None:
-        """Index the next scan of the recording."""
-        if self._ends and scan.end_stamp <= self._ends[-1]:
-            if scan.end_stamp >= self._ends[-1] - TIME_JUMP_NS:
+    def add(self, measured: Measured, log_time: int) -> None:
+        """Index the next one of the recording."""
+        if self._ends and measured.end_stamp <= self._ends[-1]:
+            if measured.end_stamp >= self._ends[-1] - TIME_JUMP_NS:
                 return
             self._ends.clear()
             self._log_times.clear()
-        self.frame = scan.frame
-        self._ends.append(scan.end_stamp)
+        self.frame = measured.frame
+        self._ends.append(measured.end_stamp)
         self._log_times.append(log_time)
+
+    def read_again(self) -> None:
+        """Forget what was read."""
+        self._loaded = {}
 
     @property
     def span(self) -> TimeSpan:
-        """The stamps of the last rays of the first and the last scan."""
+        """The stamps of the ends of the first and the last one."""
         return TimeSpan(self._ends[0], self._ends[-1])
 
     def settle(self, buffer: TransformBuffer, target: str, at: int | None) -> None:
-        """Update ``problem`` for the newest scan until ``at`` [ns]."""
+        """Update ``problem`` for the newest one until ``at`` [ns]."""
         end, reason = self._count(at), None
         if end and self.frame is not None:
             reason = buffer.explain(target, self.frame, self._ends[end - 1])
-        self.problem = None if reason is None else f"rays without a pose: {reason}"
+        self.problem = None if reason is None else f"points without a pose: {reason}"
 
-    def latest(self, count: int, at: int | None) -> Sequence[Scan]:
-        """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
+    def latest(self, count: int, at: int | None) -> Sequence[M]:
+        """The last ``count`` that ended until ``at`` [ns]; None: of all. The oldest first."""
         end = self._count(at)
-        rows = range(max(0, end - count), end)
+        return self._rows(range(max(0, end - count), end))
+
+    def within(self, window_ns: int, at: int | None) -> Sequence[M]:
+        """The last one until ``at`` [ns], and those that ended at most ``window_ns`` before it."""
+        end = self._count(at)
+        begin = bisect_left(self._ends, self._ends[end - 1] - window_ns) if end else 0
+        return self._rows(range(begin, end))
+
+    def _rows(self, rows: range) -> Sequence[M]:
         if not all(row in self._loaded for row in rows):
-            self._load(range(rows.start, min(rows.stop + _READ_AHEAD, len(self._ends))))
+            self._load(range(rows.start, min(rows.stop + self._ahead, len(self._ends))))
         return [self._loaded[row] for row in rows if row in self._loaded]
 
     def is_stale(self, at: int | None) -> bool:
@@ -94,41 +120,41 @@ class RecordedScans:
         return is_stale((at - self._ends[end - 1]) / 1e9, 1e9 / statistics.median(intervals))
 
     def _count(self, at: int | None) -> int:
-        """The number of scans that ended until ``at``."""
+        """The number of those that ended until ``at``."""
         return len(self._ends) if at is None else bisect_right(self._ends, at)
 
     def _load(self, rows: range) -> None:
-        """Keep the scans of these rows, and read the missing ones."""
-        loaded = {row: scan for row, scan in self._loaded.items() if row in rows}
+        """Keep these rows, and read the missing ones."""
+        loaded = {row: one for row, one in self._loaded.items() if row in rows}
         missing = [row for row in rows if row not in loaded]
-        for scan in self._read(self._log_times[missing[0]], self._log_times[missing[-1]] + 1):
-            row = bisect_left(self._ends, scan.end_stamp)
-            if row in rows and self._ends[row] == scan.end_stamp:
-                loaded.setdefault(row, scan)
+        for one in self._read(self._log_times[missing[0]], self._log_times[missing[-1]] + 1):
+            row = bisect_left(self._ends, one.end_stamp)
+            if row in rows and self._ends[row] == one.end_stamp:
+                loaded.setdefault(row, one)
         self._loaded = loaded
 
 
-class RecordedMap:
-    """The maps of one writer in a recording, each in effect until the next.
+class RecordedValue(Generic[V]):
+    """The maps of one writer, or the calibrations of a camera, each in effect until the next.
 
-    ``read(log_time)`` returns the map that was recorded at a log time [ns].
+    ``read(log_time)`` returns the one that was recorded at a log time [ns].
     """
 
-    def __init__(self, read: Callable[[int], Grid | None]) -> None:
+    def __init__(self, read: Callable[[int], V | None]) -> None:
         self._read = read
         self._log_times: list[int] = []
         self._withdrawn: set[int] = set()
-        self._loaded: tuple[int, Grid | None] = -1, None
-        """The row of the map that was read last, and that map."""
+        self._loaded: tuple[int, V | None] = -1, None
+        """The row that was read last, and its value."""
 
     def add(self, log_time: int, *, is_withdrawn: bool) -> None:
-        """Index the next change of the map."""
+        """Index the next change."""
         if is_withdrawn:
             self._withdrawn.add(len(self._log_times))
         self._log_times.append(log_time)
 
-    def at(self, log_time: int | None) -> Grid | None:
-        """The map in effect at ``log_time`` [ns], or at the end; None if there is none."""
+    def at(self, log_time: int | None) -> V | None:
+        """The one in effect at ``log_time`` [ns], or at the end; None if there is none."""
         row = (len(self._log_times) if log_time is None else bisect_right(self._log_times, log_time)) - 1
         if row < 0 or row in self._withdrawn:
             return None
@@ -171,7 +197,7 @@ class LogTimes:
 
 
 class RecordedWorld(Closeable):
-    """The scans and maps of all robots in the recording at ``path``, at any instant of it.
+    """The scans, clouds, pictures and maps of all robots in the recording at ``path``, at any instant of it.
 
     Call ``add`` with each message before anything is drawn. One thread draws; another may close.
     Raises RecordingError if the recording cannot be read.
@@ -180,62 +206,123 @@ class RecordedWorld(Closeable):
     problems: Sequence[tuple[str, str]] = ()
 
     def __init__(self, path: str | Path) -> None:
-        self._refusals = Refusals("recorded scans and maps")
+        self._refusals = Refusals("recorded scans, clouds, pictures and maps")
         self._reader = RecordingReader(path)
         self._recording = DecodedRecording(self._reader, self._refusals.count)
         self._lock = fork_safe_lock()
         self._is_open = True
         self._log_times = LogTimes()
         self._latched = LatchedState()
-        self._maps: dict[WriterName, RecordedMap] = {}
-        self.sensors: dict[WriterName, RecordedScans] = {}
+        self._maps: dict[WriterName, RecordedValue[Grid]] = {}
+        self._cameras: dict[WriterName, RecordedValue[Camera]] = {}
+        self.pictures: dict[WriterName, RecordedSensor[Packet]] = {}
+        self.sensors: dict[WriterName, RecordedSensor[Scan]] = {}
+        self.clouds: dict[WriterName, RecordedSensor[ThinnedCloud]] = {}
+        self._cloud_limits: dict[WriterName, int] = {}
 
     @property
     def span(self) -> TimeSpan | None:
-        """The stamps of all scans; None without scans."""
-        spans = [sensor.span for sensor in self.sensors.values()]
+        """The stamps of all scans, clouds and pictures; None without any."""
+        measured = *self.sensors.values(), *self.clouds.values(), *self.pictures.values()
+        spans = [sensor.span for sensor in measured]
         if not spans:
             return None
         return TimeSpan(min(one.oldest for one in spans), max(one.newest for one in spans))
 
     def add(self, decoded: DecodedMessage, buffer: TransformBuffer) -> None:
         """Index the next message of the recording, which ``buffer`` has."""
-        is_map = isinstance(decoded.message, OccupancyGrid) and self._add_map(decoded)
+        is_value = isinstance(decoded.message, (OccupancyGrid, CameraInfo)) and self._add_value(decoded)
         if isinstance(decoded.message, LaserScan):
             self._add_scan(decoded)
+        if isinstance(decoded.message, PointCloud):
+            self._add_cloud(decoded)
+        if isinstance(decoded.message, CompressedImage):
+            self._add_picture(decoded)
         due = self._log_times.due
-        if (is_map or due is None or decoded.log_time >= due) and (span := buffer.span()) is not None:
+        if (is_value or due is None or decoded.log_time >= due) and (span := buffer.span()) is not None:
             self._log_times.add(span.newest, decoded.log_time)
 
     def _add_scan(self, decoded: DecodedMessage) -> None:
         scan, name = self._to_scan(decoded), _name(decoded)
         if scan is not None:
             if name not in self.sensors:
-                self.sensors[name] = RecordedScans(partial(self._read_scans, name))
+                self.sensors[name] = RecordedSensor(partial(self._read_scans, name))
             self.sensors[name].add(scan, decoded.log_time)
 
-    def _add_map(self, decoded: DecodedMessage) -> bool:
-        """Returns whether the map has changed: it is repeated for readers that start in the middle."""
+    def _add_cloud(self, decoded: DecodedMessage) -> None:
+        cloud, name = self._to_cloud(decoded), _name(decoded)
+        if cloud is not None:
+            if name not in self.clouds:
+                self.clouds[name] = RecordedSensor(partial(self._read_clouds, name), _FEW_AHEAD)
+            self.clouds[name].add(cloud, decoded.log_time)
+
+    def limit_clouds(self, name: WriterName, points: int) -> None:
+        """Keep at most so many points of each cloud of a sensor, by default 200,000."""
+        if points > self._cloud_limits.get(name, CLOUD_POINTS):
+            self.clouds[name].read_again()
+        self._cloud_limits[name] = points
+
+    def _add_picture(self, decoded: DecodedMessage) -> None:
+        assert isinstance(decoded.message, CompressedImage)
+        name = _name(decoded)
+        if name not in self.pictures:
+            self.pictures[name] = RecordedSensor(partial(self._read_pictures, name), _FEW_AHEAD)
+        self.pictures[name].add(packet_from_message(decoded.message, name.robot), decoded.log_time)
+
+    def _add_value(self, decoded: DecodedMessage) -> bool:
+        """Returns whether it has changed: it is repeated for readers that start in the middle."""
         if self._latched.update(decoded) is None:
             return False
-        name = _name(decoded)
-        if name not in self._maps:
-            self._maps[name] = RecordedMap(partial(self._read_map, name))
-        assert isinstance(decoded.message, OccupancyGrid)
-        self._maps[name].add(decoded.log_time, is_withdrawn=not decoded.message.cells)
+        name, message = _name(decoded), decoded.message
+        if isinstance(message, OccupancyGrid):
+            maps = self._maps.setdefault(name, RecordedValue(partial(self._read_map, name)))
+            maps.add(decoded.log_time, is_withdrawn=not message.cells)
+        if isinstance(message, CameraInfo):
+            cameras = self._cameras.setdefault(name, RecordedValue(partial(self._read_camera, name)))
+            cameras.add(decoded.log_time, is_withdrawn=not message.is_calibrated)
         return True
 
     def maps_at(self, at: int | None) -> Mapping[WriterName, Grid]:
         """The maps in effect ``at`` a stamp [ns]; None: at the end."""
+        return self._in_effect(self._maps, at)
+
+    def cameras_at(self, at: int | None) -> Mapping[WriterName, Camera]:
+        """The calibrations in effect ``at`` a stamp [ns]; None: at the end."""
+        return self._in_effect(self._cameras, at)
+
+    def _in_effect(
+        self, values: Mapping[WriterName, RecordedValue[V]], at: int | None
+    ) -> Mapping[WriterName, V]:
         log_time = None if at is None else self._log_times.log_time(at)
-        grids = {name: maps.at(log_time) for name, maps in self._maps.items()}
-        return {name: grid for name, grid in grids.items() if grid is not None}
+        found = {name: value.at(log_time) for name, value in values.items()}
+        return {name: value for name, value in found.items() if value is not None}
 
     def _read_scans(self, name: WriterName, begin: int, end: int) -> Iterator[Scan]:
         for decoded in self._messages(name, SCAN.name, begin, end):
             scan = self._to_scan(decoded)
             if scan is not None:
                 yield scan
+
+    def _read_clouds(self, name: WriterName, begin: int, end: int) -> Iterator[ThinnedCloud]:
+        for decoded in self._messages(name, CLOUD.name, begin, end):
+            cloud = self._to_cloud(decoded)
+            if cloud is not None:
+                yield thinned_cloud(cloud, self._cloud_limits.get(name, CLOUD_POINTS))
+
+    def _read_pictures(self, name: WriterName, begin: int, end: int) -> Iterator[Packet]:
+        for decoded in self._messages(name, IMAGE.name, begin, end):
+            assert isinstance(decoded.message, CompressedImage)
+            yield packet_from_message(decoded.message, name.robot)
+
+    def _read_camera(self, name: WriterName, log_time: int) -> Camera | None:
+        info: Message | None = None
+        for decoded in self._messages(name, CAMERA_INFO.name, log_time, log_time + 1):
+            info = decoded.message
+        try:
+            return camera_from_message(info, name.robot) if isinstance(info, CameraInfo) else None
+        except InvalidInput as error:
+            self._refusals.count("malformed calibration", f"{name}: {error}")
+            return None
 
     def _read_map(self, name: WriterName, log_time: int) -> Grid | None:
         grid: Message | None = None
@@ -249,12 +336,12 @@ class RecordedWorld(Closeable):
 
     def _messages(
         self, name: WriterName, stream: StreamName, begin: int, end: int
-    ) -> Sequence[DecodedMessage]:
+    ) -> Iterator[DecodedMessage]:
         with self._lock:
             if not self._is_open:
-                return ()
+                return
             messages = self._recording.messages((name.robot,), (stream,), begin, end)
-            return [decoded for decoded in messages if _name(decoded) == name]
+            yield from (decoded for decoded in messages if _name(decoded) == name)
 
     def _to_scan(self, decoded: DecodedMessage) -> Scan | None:
         assert isinstance(decoded.message, LaserScan)
@@ -263,6 +350,16 @@ class RecordedWorld(Closeable):
         except InvalidInput as error:
             self._refusals.count("malformed scan", f"{_name(decoded)}: {error}")
             return None
+
+    def _to_cloud(self, decoded: DecodedMessage) -> Cloud | None:
+        assert isinstance(decoded.message, PointCloud)
+        try:
+            cloud = cloud_from_message(decoded.message, decoded.writer.robot)
+            _ = cloud.end_stamp  # raises for impossible times
+        except InvalidInput as error:
+            self._refusals.count("malformed cloud", f"{_name(decoded)}: {error}")
+            return None
+        return cloud
 
     def close(self) -> None:
         """Close the file. A second call does nothing."""

@@ -22,6 +22,7 @@ from zstate.rate import Rate
 from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Visibility, fit_camera, robot_visibility
 from zstate.view.data_source import FixedFrame, ViewSource
 from zstate.view.panels import html
+from zstate.view.panels.camera_panel import CamerasPanel
 from zstate.view.panels.control_panels import (
     DriversPanel,
     PlotsPanel,
@@ -159,15 +160,18 @@ class View(Closeable):
         fixed = self.layout.fixed.resolve(snapshot.tree) or own
         with self._page.server.atomic():
             try:
+                self.scene.cameras.read(self._source.world, self._source.buffer, self.scene.kinds, at)
                 if fixed:
                     poses = self.scene.show(snapshot, fixed) if snapshot.tree.names else _NO_POSES
                     place = DrawnFrames(snapshot.tree, poses, fixed)
                     self.scene.world.show(self._source.world, self._source.buffer, place, at)
+                    self.scene.clouds.show(self._source.world, self._source.buffer, place, at)
+                    self.scene.cameras.show(place)
                     self.scene.odometry.show(self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
                         self._held_poses = poses
-                        if not self.scene.busy:
+                        if not self.scene.busy and not self.scene.clouds.busy:
                             self._hold_complete.set()
             finally:
                 # Panels mark robots that have become stale since: wrong in a picture of an earlier instant.
@@ -288,6 +292,7 @@ class PanelLayout(Closeable):
             with tabs.add_tab("Graph"):
                 monitor = self._resources.enter_context(GraphMonitor(source.session))
                 self._panels.append(GraphPanel(gui, monitor))
+        self._panels.append(CamerasPanel(gui, tabs, scene.cameras))
 
     @property
     def stamp(self) -> int | None:

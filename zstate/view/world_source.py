@@ -1,13 +1,14 @@
-"""Scans and maps to draw, from the network."""
+"""Scans, clouds, pictures and maps to draw, from the network."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from itertools import islice, takewhile
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
@@ -15,6 +16,12 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import TimeSpan
+from zstate.cameras.camera import Camera, camera_from_message
+from zstate.cameras.messages import CameraInfo, CompressedImage
+from zstate.cameras.plugin import CAMERA_INFO, IMAGE
+from zstate.clouds.cloud import cloud_from_message
+from zstate.clouds.messages import PointCloud
+from zstate.clouds.plugin import CLOUD
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.ingest.deadline import Deadline
 from zstate.net.presence import announce_reader
@@ -24,26 +31,61 @@ from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
+from zstate.view.pictures import Packet, packet_from_message
+from zstate.view.thinned_cloud import ThinnedCloud, thinned_cloud
 from zstate.wire.keys import ANY, shortened
 from zstate.wire.registry import get_wire
 
 _TIMEOUT_S = 1.0
-"""How long a scan waits for the pose of its last ray, as in ``ScanListener``."""
+"""How long a measurement waits for the pose of its end, as in ``ScanListener`` and ``CloudListener``."""
 _MAX_WAITING = 256
-_MAX_SCANS = 1000
-_MAX_BYTES = 4_000_000
+_MAX_KEPT = 1000
+_SCAN_BYTES = 4_000_000
 """Limits of the waiting and of the kept scans of one sensor: half a minute of 1081 rays and 30 Hz."""
+_CLOUD_BYTES = 128_000_000
+"""Limits of the waiting and of the kept clouds of one sensor: 4 million points with intensity and time."""
+_PICTURE_BYTES = 64_000_000
+"""The limit of the pictures of one camera: 500 of 720 rows."""
+CLOUD_POINTS = 200_000
+"""The points that are kept of each cloud of a sensor without a limit of its own."""
 _MAX_WRITERS = 64
 _UNKNOWN_S = 10.0
 """How long a sensor may be silent after its first scan."""
 _TOO_MANY_SENSORS = "too many sensors"
+_TOO_MANY_CLOUDS = "too many sensors of clouds"
+_TOO_MANY_CAMERAS = "too many cameras"
 _TOO_MANY_MAPS = "too many maps"
-_FURTHER = {_TOO_MANY_SENSORS: "scans of further sensors", _TOO_MANY_MAPS: "further maps"}
-WORLD_STREAMS = SCAN.name, MAP.name
+_FURTHER = {
+    _TOO_MANY_SENSORS: "scans of further sensors",
+    _TOO_MANY_CLOUDS: "clouds of further sensors",
+    _TOO_MANY_CAMERAS: "pictures of further cameras",
+    _TOO_MANY_MAPS: "further maps",
+}
+WORLD_STREAMS = SCAN.name, CLOUD.name, IMAGE.name, CAMERA_INFO.name, MAP.name
 """What surrounds robots."""
 
 TIME_JUMP_NS = 1_000_000_000
-"""A scan that is so much older than the last one begins again."""
+"""A measurement that is so much older than the last one begins again."""
+
+
+class Measured(Protocol):
+    """A scan, a cloud or a picture: measured in ``frame`` from ``stamp`` to ``end_stamp`` [ns]."""
+
+    @property
+    def stamp(self) -> int: ...
+
+    @property
+    def end_stamp(self) -> int: ...
+
+    @property
+    def frame(self) -> str: ...
+
+    @property
+    def nbytes(self) -> int: ...
+
+
+M = TypeVar("M", bound=Measured)
+M_co = TypeVar("M_co", bound=Measured, covariant=True)
 
 
 class WriterName(NamedTuple):
@@ -56,23 +98,27 @@ class WriterName(NamedTuple):
         return f"{self.robot}/{self.name}"
 
 
-class Sensor(Protocol):
-    """The scans of one sensor, as they are drawn. ``problem`` is why some are not; None if all are."""
+class Sensor(Protocol[M_co]):
+    """What one sensor measured, as it is drawn. ``problem`` is why some of it is not, if any."""
 
     @property
     def frame(self) -> str | None:
-        """The frame of the newest scan."""
+        """The frame of the newest one."""
         ...
 
     @property
     def problem(self) -> str | None: ...
 
     def settle(self, buffer: TransformBuffer, target: str, at: int | None) -> None:
-        """Decide which scans have poses in ``target``, and update ``problem``."""
+        """Decide which of them have poses in ``target``, and update ``problem``."""
         ...
 
-    def latest(self, count: int, at: int | None) -> Sequence[Scan]:
-        """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
+    def latest(self, count: int, at: int | None) -> Sequence[M_co]:
+        """The last ``count`` that ended until ``at`` [ns]; None: of all. The oldest first."""
+        ...
+
+    def within(self, window_ns: int, at: int | None) -> Sequence[M_co]:
+        """The last one until ``at`` [ns], and those that ended at most ``window_ns`` before it."""
         ...
 
     def is_stale(self, at: int | None) -> bool:
@@ -81,20 +127,34 @@ class Sensor(Protocol):
 
 
 class WorldData(Protocol):
-    """What is around the robots, as it is drawn: scans and maps.
+    """What is around the robots, as it is drawn: scans, clouds, pictures and maps.
 
     ``problems`` are what cannot be drawn at all, with the reason.
     """
 
     @property
-    def sensors(self) -> Mapping[WriterName, Sensor]: ...
+    def sensors(self) -> Mapping[WriterName, Sensor[Scan]]: ...
+
+    @property
+    def clouds(self) -> Mapping[WriterName, Sensor[ThinnedCloud]]: ...
+
+    def limit_clouds(self, name: WriterName, points: int) -> None:
+        """Keep at most so many points of each further cloud of a sensor."""
+        ...
+
+    @property
+    def pictures(self) -> Mapping[WriterName, Sensor[Packet]]: ...
+
+    def cameras_at(self, at: int | None) -> Mapping[WriterName, Camera]:
+        """The calibration of each camera ``at`` a stamp [ns]; None: the newest."""
+        ...
 
     @property
     def problems(self) -> Sequence[tuple[str, str]]: ...
 
     @property
     def span(self) -> TimeSpan | None:
-        """The stamps of all scans; None if they are only drawn as they arrive."""
+        """The stamps of all scans, clouds and pictures; None if they are only drawn as they arrive."""
         ...
 
     def maps_at(self, at: int | None) -> Mapping[WriterName, Grid]:
@@ -105,31 +165,36 @@ class WorldData(Protocol):
 
 
 @dataclass(eq=False)
-class SensorScans:
-    """The scans of one sensor: those that wait for the pose of their last ray, and the last ones with it.
+class LiveSensor(Generic[M]):
+    """What one sensor measured: scans or clouds that wait for the pose of their end, and the last with it.
 
-    ``dropped`` counts scans whose pose did not come within a second, or before too many others waited.
-    ``reason`` is why the newest scan was dropped, None if it was kept; one that still waits does not count.
-    ``clock`` is a monotonic clock [s].
+    Pictures wait for nothing.
+
+    ``dropped`` counts those whose pose did not come within a second, or before too many others waited.
+    ``reason`` is why the newest one was dropped, None if it was kept; one that still waits does not count.
+    ``clock`` is a monotonic clock [s]. ``max_bytes`` are those of the waiting, and of the kept ones.
     """
 
     clock: Callable[[], float] = time.monotonic
+    max_bytes: int = _SCAN_BYTES
     dropped: int = 0
     reason: LookupFailed | InvalidInput | None = None
-    _waiting: BoundedQueue[tuple[Scan, float]] = field(
-        default_factory=lambda: BoundedQueue(_MAX_WAITING, _MAX_BYTES)
-    )
-    _scans: BoundedQueue[Scan] = field(default_factory=lambda: BoundedQueue(_MAX_SCANS, _MAX_BYTES))
+    _waiting: BoundedQueue[tuple[M, float]] = field(init=False)
+    _kept: BoundedQueue[M] = field(init=False)
     _deadline: Deadline = field(default_factory=lambda: Deadline(_UNKNOWN_S))
     _has_overflowed: bool = False
     _lock: threading.Lock = field(default_factory=fork_safe_lock)
 
-    def add(self, scan: Scan) -> None:
-        """Keep a scan that has arrived. Called by one thread, the other methods by another."""
+    def __post_init__(self) -> None:
+        self._waiting = BoundedQueue(_MAX_WAITING, self.max_bytes)
+        self._kept = BoundedQueue(_MAX_KEPT, self.max_bytes)
+
+    def add(self, measured: M) -> None:
+        """Keep what has arrived. Called by one thread, the other methods by another."""
         now_s = self.clock()
         self._deadline.on_sample(now_s)
         with self._lock:
-            lost = self._waiting.append((scan, now_s + _TIMEOUT_S), scan.nbytes)
+            lost = self._waiting.append((measured, now_s + _TIMEOUT_S), measured.nbytes)
             self.dropped += lost
             self._has_overflowed |= lost > 0
 
@@ -137,28 +202,34 @@ class SensorScans:
         """Whether the sensor has missed its deadline, at present."""
         return self._deadline.is_missed(self.clock())
 
+    def keep(self, measured: M) -> None:
+        """Keep what has arrived, and needs no pose."""
+        self._deadline.on_sample(self.clock())
+        with self._lock:
+            self._append(measured)
+
     @property
     def received_s(self) -> float:
-        """When the newest scan arrived, by ``clock``."""
+        """When the newest one arrived, by ``clock``."""
         return self._deadline.last_s
 
     @property
     def frame(self) -> str | None:
-        """The frame of the newest scan."""
+        """The frame of the newest one."""
         with self._lock:
-            newest = self._waiting[0][0] if self._waiting else self._scans[-1] if self._scans else None
+            newest = self._waiting[0][0] if self._waiting else self._kept[-1] if self._kept else None
         return None if newest is None else newest.frame
 
     @property
     def problem(self) -> str | None:
-        """Why the newest scan was dropped, and how many were; None if it was kept."""
+        """Why the newest one was dropped, and how many were; None if it was kept."""
         return None if self.reason is None else f"{self.dropped} dropped: {self.reason}"
 
     def settle(self, buffer: TransformBuffer, target: str, at: int | None = None) -> None:
-        """Keep the scans whose last ray has a pose in ``target`` by now, and drop those that are too late."""
+        """Keep those whose end has a pose in ``target`` by now, and drop those that are too late."""
         while (waiting := self._first_waiting()) is not None:
-            scan, deadline_s = waiting
-            reason = buffer.explain(target, scan.frame, scan.end_stamp)
+            measured, deadline_s = waiting
+            reason = buffer.explain(target, measured.frame, measured.end_stamp)
             if reason is not None and self.clock() < deadline_s:
                 if self._has_overflowed:
                     self.reason, self._has_overflowed = reason, False
@@ -166,13 +237,14 @@ class SensorScans:
             if self._remove_first(waiting, is_dropped=reason is not None):
                 self.reason = reason
                 if reason is None:
-                    self._keep(scan)
+                    with self._lock:
+                        self._append(measured)
 
-    def _first_waiting(self) -> tuple[Scan, float] | None:
+    def _first_waiting(self) -> tuple[M, float] | None:
         with self._lock:
             return self._waiting[0] if self._waiting else None
 
-    def _remove_first(self, waiting: tuple[Scan, float], *, is_dropped: bool) -> bool:
+    def _remove_first(self, waiting: tuple[M, float], *, is_dropped: bool) -> bool:
         """Remove ``waiting``, unless it was lost as the queue overflowed. Returns whether it was there."""
         with self._lock:
             if not self._waiting or self._waiting[0] is not waiting:
@@ -181,28 +253,45 @@ class SensorScans:
             self.dropped += is_dropped
         return True
 
-    def _keep(self, scan: Scan) -> None:
-        if self._scans and scan.stamp < self._scans[-1].stamp - TIME_JUMP_NS:
-            self._scans.clear()  # the clock was set back, or a replay has begun again
-        self._scans.append(scan, scan.nbytes)
+    def _append(self, measured: M) -> None:
+        if self._kept and measured.stamp < self._kept[-1].stamp - TIME_JUMP_NS:
+            self._kept.clear()  # the clock was set back, or a replay has begun again
+        self._kept.append(measured, measured.nbytes)
 
-    def latest(self, count: int, at: int | None = None) -> Sequence[Scan]:
-        """The last ``count`` scans that ended until ``at`` [ns]; None: of all. The oldest first."""
-        found: list[Scan] = []
-        for scan in reversed(self._scans):
-            if len(found) == count:
-                break
-            if at is None or scan.end_stamp <= at:
-                found.append(scan)
-        return found[::-1]
+    def latest(self, count: int, at: int | None = None) -> Sequence[M]:
+        """The last ``count`` that ended until ``at`` [ns]; None: of all. The oldest first."""
+        with self._lock:
+            return [*islice(self._until(at), count)][::-1]
+
+    def within(self, window_ns: int, at: int | None = None) -> Sequence[M]:
+        """The last one until ``at`` [ns], and those that ended at most ``window_ns`` before it."""
+        with self._lock:
+            newest = next(self._until(at), None)
+            if newest is None:
+                return ()
+            begin = newest.end_stamp - window_ns
+            return [*takewhile(lambda one: one.end_stamp >= begin, self._until(at))][::-1]
+
+    def _until(self, at: int | None) -> Iterator[M]:
+        """Those that ended until ``at``, the newest first."""
+        return (one for one in reversed(self._kept) if at is None or one.end_stamp <= at)
+
+
+class _SensorTable(dict[WriterName, LiveSensor[M]]):
+    """The sensors of one stream; ``too_many`` is why another is refused, ``max_bytes`` are those of each."""
+
+    def __init__(self, too_many: str, max_bytes: int) -> None:
+        super().__init__()
+        self.too_many, self.max_bytes = too_many, max_bytes
 
 
 class WorldSource(Closeable):
-    """Receives the scans of all robots, or of ``robots`` only, and all maps; nothing without a ``session``.
+    """Receives the scans, clouds and pictures of all robots, or of ``robots`` only, and all maps.
 
-    ``maps`` and ``sensors`` are by the names of their writers; a map that is withdrawn is removed from
-    ``maps``, and the longest stale sensor when there are more than 64. ``refused`` counts messages that are
-    no scan or map, or for which there is no room, by reason; the first of each is logged.
+    Without a ``session`` it receives nothing. ``maps``, ``sensors``, ``clouds`` and ``pictures`` are by the
+    names of their writers; a map that is withdrawn is removed from ``maps``, and the longest stale sensor
+    when there are more than 64. ``refused`` counts messages that are none of these, or for which there is no
+    room, by reason; the first of each is logged.
     """
 
     def __init__(
@@ -217,7 +306,11 @@ class WorldSource(Closeable):
         self._selected = frozenset(robots)
         self._wire = get_wire(wire)
         self._lock = fork_safe_lock()
-        self._sensors: dict[WriterName, SensorScans] = {}
+        self._sensors = _SensorTable[Scan](_TOO_MANY_SENSORS, _SCAN_BYTES)
+        self._clouds = _SensorTable[ThinnedCloud](_TOO_MANY_CLOUDS, _CLOUD_BYTES)
+        self._cloud_limits: dict[WriterName, int] = {}
+        self._pictures = _SensorTable[Packet](_TOO_MANY_CAMERAS, _PICTURE_BYTES)
+        self._cameras: dict[str, tuple[WriterName, Camera]] = {}
         self._maps: dict[str, tuple[WriterName, Grid]] = {}
         self._refusals = Refusals()
         self.refused: Mapping[str, int] = self._refusals.counts
@@ -227,6 +320,22 @@ class WorldSource(Closeable):
                 count = self._refusals.count
                 scans = subscribe(session, self._wire, robot, SCAN.name, self._on_scans, on_error=count)
                 opening.enter_context(scans)
+                clouds = subscribe(session, self._wire, robot, CLOUD.name, self._on_clouds, on_error=count)
+                opening.enter_context(clouds)
+                pictures = subscribe(
+                    session, self._wire, robot, IMAGE.name, self._on_pictures, on_error=count
+                )
+                opening.enter_context(pictures)
+                cameras = subscribe(
+                    session,
+                    self._wire,
+                    robot,
+                    CAMERA_INFO.name,
+                    self._on_cameras,
+                    on_error=count,
+                    on_withdrawn=self._on_camera_withdrawn,
+                )
+                opening.enter_context(cameras)
                 maps = subscribe(
                     session,
                     self._wire,
@@ -258,10 +367,20 @@ class WorldSource(Closeable):
         ]
 
     @property
-    def sensors(self) -> Mapping[WriterName, SensorScans]:
+    def sensors(self) -> Mapping[WriterName, LiveSensor[Scan]]:
         """The scans of each sensor."""
         with self._lock:
             return dict(self._sensors)
+
+    @property
+    def clouds(self) -> Mapping[WriterName, LiveSensor[ThinnedCloud]]:
+        """The clouds of each sensor."""
+        with self._lock:
+            return dict(self._clouds)
+
+    def limit_clouds(self, name: WriterName, points: int) -> None:
+        """Keep at most so many points of each further cloud of a sensor, by default 200,000."""
+        self._cloud_limits[name] = points
 
     def _on_scans(self, received: list[Received]) -> None:
         for robot, key, message in received:
@@ -273,25 +392,82 @@ class WorldSource(Closeable):
             except InvalidInput as error:
                 self._refusals.count("malformed scan", f"{shortened(key)}: {error}")
                 continue
-            sensor = self._scans_of(self._writer(robot, key))
-            if sensor is None:
-                text = (
-                    f"{shortened(key)} is not drawn, as {_MAX_WRITERS} other sensors are; "
-                    "`zstate view ROBOT` draws those of one robot"
-                )
-                self._refusals.count(_TOO_MANY_SENSORS, text)
-            else:
+            sensor = self._sensor_of(key, self._sensors, self._writer(robot, key))
+            if sensor is not None:
                 sensor.add(scan)
 
-    def _scans_of(self, name: WriterName) -> SensorScans | None:
-        """The scans of a sensor, which replaces the longest stale one; None if there is no room."""
+    def _on_clouds(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            if self._selected and robot not in self._selected:
+                continue
+            name = self._writer(robot, key)
+            try:
+                assert isinstance(message, PointCloud)
+                most = self._cloud_limits.get(name, CLOUD_POINTS)
+                cloud = thinned_cloud(cloud_from_message(message, robot), most)
+            except InvalidInput as error:
+                self._refusals.count("malformed cloud", f"{shortened(key)}: {error}")
+                continue
+            sensor = self._sensor_of(key, self._clouds, name)
+            if sensor is not None:
+                sensor.add(cloud)
+
+    @property
+    def pictures(self) -> Mapping[WriterName, LiveSensor[Packet]]:
+        """The pictures of each camera."""
         with self._lock:
-            if name not in self._sensors and len(self._sensors) >= _MAX_WRITERS:
-                stale = [(one.received_s, other) for other, one in self._sensors.items() if one.is_stale()]
-                if not stale:
-                    return None
-                del self._sensors[min(stale)[1]]
-            return self._sensors.setdefault(name, SensorScans(self._clock))
+            return dict(self._pictures)
+
+    def cameras_at(self, at: int | None = None) -> Mapping[WriterName, Camera]:
+        """The newest calibration of each camera: those before it are not kept."""
+        with self._lock:
+            return dict(self._cameras.values())
+
+    def _on_pictures(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            if self._selected and robot not in self._selected:
+                continue
+            assert isinstance(message, CompressedImage)
+            sensor = self._sensor_of(key, self._pictures, self._writer(robot, key))
+            if sensor is not None:
+                sensor.keep(packet_from_message(message, robot))
+
+    def _on_cameras(self, received: list[Received]) -> None:
+        for robot, key, message in received:
+            if self._selected and robot not in self._selected:
+                continue
+            assert isinstance(message, CameraInfo)
+            try:
+                camera = camera_from_message(message, robot) if message.is_calibrated else None
+            except InvalidInput as error:
+                self._refusals.count("malformed calibration", f"{shortened(key)}: {error}")
+                continue
+            with self._lock:
+                if camera is None:
+                    self._cameras.pop(key, None)
+                elif key in self._cameras or len(self._cameras) < _MAX_WRITERS:
+                    self._cameras[key] = self._writer(robot, key), camera
+
+    def _on_camera_withdrawn(self, key: str) -> None:
+        with self._lock:
+            self._cameras.pop(key, None)
+
+    def _sensor_of(self, key: str, sensors: _SensorTable[M], name: WriterName) -> LiveSensor[M] | None:
+        """The sensor of this name, which replaces the longest stale one; None if there is no room."""
+        with self._lock:
+            if name in sensors:
+                return sensors[name]
+            stale = [(one.received_s, other) for other, one in sensors.items() if one.is_stale()]
+            if len(sensors) < _MAX_WRITERS or stale:
+                if len(sensors) >= _MAX_WRITERS:
+                    del sensors[min(stale)[1]]
+                return sensors.setdefault(name, LiveSensor(self._clock, sensors.max_bytes))
+        text = (
+            f"{shortened(key)} is not drawn, as {_MAX_WRITERS} other sensors are; "
+            "`zstate view ROBOT` draws those of one robot"
+        )
+        self._refusals.count(sensors.too_many, text)
+        return None
 
     def _on_maps(self, received: list[Received]) -> None:
         for robot, key, message in received:

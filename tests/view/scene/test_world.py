@@ -16,7 +16,7 @@ from zstate.buffer.buffer import TransformBuffer  # noqa: E402
 from zstate.scans import Grid, Scan  # noqa: E402
 from zstate.transform import Transform  # noqa: E402
 from zstate.view.scene.world import DrawnFrames, World  # noqa: E402
-from zstate.view.world_source import SensorScans, WorldSource, WriterName  # noqa: E402
+from zstate.view.world_source import LiveSensor, WorldSource, WriterName  # noqa: E402
 
 MS = 1_000_000
 FRONT, HALL = WriterName("r1", "front"), WriterName("hall", "map")
@@ -39,7 +39,7 @@ class FixedSource(WorldSource):
 
     def __init__(self) -> None:
         super().__init__(None)
-        self._sensors[FRONT] = SensorScans()
+        self._sensors[FRONT] = LiveSensor()
         self.front = self._sensors[FRONT]
 
     def set_map(self, grid: Grid) -> None:

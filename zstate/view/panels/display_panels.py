@@ -23,11 +23,14 @@ from zstate.view.data_source import FixedFrame, ViewSource
 from zstate.view.panels import html
 from zstate.view.panels.html import Rows, format_number, pose_rows
 from zstate.view.panels.panel import BoundWidget, FrameDropdown, PanelContext
+from zstate.view.scene.clouds import CLOUD_COLORS, Clouds
 from zstate.view.scene.scene import Scene
 
 _DISPLAYS = ("visuals", "collisions", "axes", "names", "parent_lines")
 _MAX_SCANS = 50
 _MAX_PATH_S = 30  # the buffer's history
+_MAX_CLOUDS_S = 30.0
+_POINTS_STEP, _MAX_POINTS = 20, 2000
 _MAX_LINES = 12
 _MAX_FRAMES = 10
 _NO_POSE = "no pose"
@@ -54,6 +57,7 @@ class DisplayPanel:
         self._scan_count = gui.add_slider(
             "Last scans", min=1, max=_MAX_SCANS, step=1, initial_value=world.scan_count, hint=hint
         )
+        self._clouds = CloudControls(gui, scene.clouds)
         self._maps = gui.add_checkbox("Maps", world.maps)
         odometry = scene.odometry
         hint = "The path of each base whose pose has a covariance, and the ellipse that it is in with 95 %."
@@ -77,8 +81,41 @@ class DisplayPanel:
         world = self._scene.world
         world.scans, world.maps = self._scans.value, self._maps.value
         world.scan_count = int(self._scan_count.value)
+        self._clouds.update()
         odometry = self._scene.odometry
         odometry.is_on, odometry.path_s = self._odometry.value, self._path_s.value
+
+
+class CloudControls:
+    """What is drawn of clouds; shown when there are clouds."""
+
+    def __init__(self, gui: viser.GuiApi, clouds: Clouds) -> None:
+        self._drawn = clouds
+        self._folder = gui.add_folder("Clouds", visible=False)
+        with self._folder:
+            self._is_on = gui.add_checkbox("Draw clouds", clouds.is_on)
+            hint = "Sensors without this value have one colour each."
+            self._color = gui.add_dropdown("Coloured by", CLOUD_COLORS, initial_value=clouds.color, hint=hint)
+            hint = "How long points remain in the fixed frame; 0: only the newest cloud of each sensor."
+            self._window_s = gui.add_slider(
+                "Last seconds", min=0.0, max=_MAX_CLOUDS_S, step=0.5, initial_value=clouds.window_s, hint=hint
+            )
+            hint = "The points of all clouds together are thinned out to so many, in thousands."
+            self._points = gui.add_slider(
+                "Points [1000]",
+                min=_POINTS_STEP,
+                max=_MAX_POINTS,
+                step=_POINTS_STEP,
+                initial_value=clouds.points // 1000,
+                hint=hint,
+            )
+
+    def update(self) -> None:
+        """Apply the user's input."""
+        clouds = self._drawn
+        self._folder.visible = clouds.has_any
+        clouds.is_on, clouds.color = self._is_on.value, self._color.value
+        clouds.window_s, clouds.points = self._window_s.value, 1000 * int(self._points.value)
 
 
 class RobotsPanel:
@@ -114,7 +151,9 @@ class RobotsPanel:
         poses = [track for track in silent if isinstance(track, PoseTrack)]
         edges = [f"{track.name}: {silent[track]}" for track in poses]
         meshes = [f"{uri}\n    {why}" for robot in robots for uri, why in self._scene.missing_meshes(robot)]
-        around = [f"{name}: {why}" for name, why in self._scene.world.missing]
+        scene = self._scene
+        missing = *scene.world.missing, *scene.clouds.missing, *scene.cameras.missing
+        around = [f"{name}: {why}" for name, why in missing]
         self._missing.content = (
             disconnected_html(tree, context.fixed)
             + unplaced_html(context.snapshot)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +18,8 @@ from zstate.model.findings import Finding
 from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
 from zstate.view.meshes import Meshes, MeshLoader
+from zstate.view.scene.cameras import Cameras
+from zstate.view.scene.clouds import Clouds
 from zstate.view.scene.frames import (
     Axes,
     FrameLabels,
@@ -45,8 +47,9 @@ class Scene:
 
     Attributes, used by the next ``show``: ``visuals`` and ``collisions`` of robots (the latter translucent),
     and ``axes``, ``names`` and ``parent_lines`` of frames. ``layout`` places unconnected trees; ``world``
-    draws scans and maps, ``odometry`` the paths of bases. Meshes and maps are loaded in the background; the
-    scene is ``busy`` until all are drawn. To be used by one thread.
+    draws scans and maps, ``clouds`` those of lidars, ``cameras`` pictures on frustums, ``odometry`` the paths
+    of bases. Meshes and maps are loaded in the background; the scene is ``busy`` until all are drawn. To be
+    used by one thread.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -73,6 +76,8 @@ class Scene:
         self._lines = ParentLines(scene)
         self._trails = Trails(scene)
         self.world = World(scene)
+        self.clouds = Clouds(scene)
+        self.cameras = Cameras(scene)
         self.odometry = OdometryPaths(scene)
         self.layout = TreeLayout()
         self._stale_labels = NodeLabels(scene, "stale", anchor="top-center")
@@ -140,6 +145,11 @@ class Scene:
     def set_trail(self, frame: str, on: bool) -> None:
         """Start or remove the trail of a frame."""
         self._trails.set_trail(frame, on)
+
+    @property
+    def kinds(self) -> Mapping[str, RobotKind]:
+        """The shapes of each robot with a model."""
+        return {robot: meshes.kind for meshes in self._meshes() for robot in meshes.robots}
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
         """Files of a robot that cannot be drawn: the name in the URDF, and the reason."""

@@ -18,9 +18,9 @@ from zstate.scans.grid import Grid
 from zstate.scans.scan import Scan
 from zstate.view.world_source import Sensor, WorldData, WriterName
 
-_POINT_SIZE_M = 0.03
-_COLORS = ((224, 49, 49), (25, 113, 194), (47, 158, 68), (174, 62, 201), (232, 89, 12), (12, 133, 153))
-_STALE_COLOR = 140, 145, 153
+_SCAN_POINT_M = 0.03
+SENSOR_COLORS = ((224, 49, 49), (25, 113, 194), (47, 158, 68), (174, 62, 201), (232, 89, 12), (12, 133, 153))
+STALE_COLOR = 140, 145, 153
 _BACKGROUND = 255.0
 _OLDEST_FADE = 0.75
 """How much of the background's white is in the colour of the oldest scan."""
@@ -94,7 +94,7 @@ class World:
         for name, sensor in sensors.items():
             clouds = self._clouds.get(name)
             if clouds is None:
-                color = _COLORS[self._cloud_count % len(_COLORS)]
+                color = SENSOR_COLORS[self._cloud_count % len(SENSOR_COLORS)]
                 clouds = self._clouds[name] = ScanClouds(
                     self._scene, buffer, f"/scans/{self._cloud_count}", color
                 )
@@ -121,31 +121,25 @@ class ScanClouds:
     def __init__(
         self, scene: viser.SceneApi, buffer: TransformBuffer, path: str, color: tuple[int, int, int]
     ) -> None:
-        self._scene = scene
         self._buffer = buffer
-        self._path = path
         self._color = color
         self._target = ""
-        self._root: viser.FrameHandle | None = None
+        self._nodes = PointNodes(scene, path, _SCAN_POINT_M)
         self._drawn: dict[Scan, viser.PointCloudHandle] = {}
-        self._free: list[viser.PointCloudHandle] = []
-        self._count = 0
         self._state: tuple[Sequence[Scan], str, int, bool] | None = None
 
-    def show(self, sensor: Sensor, place: DrawnFrames, count: int, at: int | None) -> None:
+    def show(self, sensor: Sensor[Scan], place: DrawnFrames, count: int, at: int | None) -> None:
         """Draw the last ``count`` scans of ``sensor`` until ``at`` [ns]."""
         frame = sensor.frame
         if frame is None:
             return
         target = place.connected(frame)
         sensor.settle(self._buffer, target, at)
-        if self._root is None:
-            self._root = self._scene.add_frame(self._path, show_axes=False)
         pose = place.pose(target)
         if pose is None or frame not in place.tree.index:
             count = 0
         else:
-            move_node(self._root, pose)
+            self._nodes.move(pose)
         state = sensor.latest(count, at), target, count, sensor.is_stale(at)
         if state != self._state:
             self._state = state
@@ -153,38 +147,65 @@ class ScanClouds:
 
     def remove(self) -> None:
         """Remove the clouds from the scene."""
-        if self._root is not None:
-            self._root.remove()
+        self._nodes.remove()
 
     def _update(self, scans: Sequence[Scan], target: str, count: int, is_stale: bool) -> None:
         is_moved, self._target = target != self._target, target
         for scan in [scan for scan in self._drawn if is_moved or scan not in scans]:
-            cloud = self._drawn.pop(scan)
-            cloud.visible = False
-            self._free.append(cloud)
-        color = _STALE_COLOR if is_stale else self._color
+            self._nodes.hide(self._drawn.pop(scan))
+        color = STALE_COLOR if is_stale else self._color
         for age, scan in enumerate(reversed(scans)):
-            if scan not in self._drawn:
-                self._draw(scan)
-            self._drawn[scan].colors = _faded(color, age, count)
+            shade = _faded(color, age, count)
+            if scan in self._drawn:
+                self._drawn[scan].colors = shade
+            else:
+                self._drawn[scan] = self._nodes.add(place_scan(self._buffer, scan, self._target), shade)
 
-    def _draw(self, scan: Scan) -> None:
-        points = place_scan(self._buffer, scan, self._target)
+
+class PointNodes:
+    """Point clouds of one sensor, below a node at ``path`` that moves all of them.
+
+    A node that is hidden is used again for the next points: a server keeps a message of each name that it has
+    used. ``size`` is that of a point [m].
+    """
+
+    def __init__(self, scene: viser.SceneApi, path: str, size: float) -> None:
+        self._scene = scene
+        self._path = path
+        self._size = size
+        self._root = scene.add_frame(path, show_axes=False)
+        self._free: list[viser.PointCloudHandle] = []
+        self._count = 0
+
+    def move(self, pose: se3.Pose) -> None:
+        """Move all of them to ``pose``."""
+        move_node(self._root, pose)
+
+    def add(self, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> viser.PointCloudHandle:
+        """Draw ``points`` (N, 3) [m] in ``colors``, (N, 3) or (3,)."""
         if self._free:
-            cloud = self._drawn[scan] = self._free.pop()
-            cloud.points = points
-            cloud.visible = True
-            return
+            node = self._free.pop()
+            node.points, node.colors, node.visible = points, colors, True
+            return node
         self._count += 1
-        self._drawn[scan] = self._scene.add_point_cloud(
+        return self._scene.add_point_cloud(
             f"{self._path}/{self._count}",
             points,
-            self._color,
-            point_size=_POINT_SIZE_M,
+            colors,
+            point_size=self._size,
             point_shape="circle",
             point_shading="flat",
             precision="float32",  # of float16 the steps are 8 mm at a distance of 10 m
         )
+
+    def hide(self, node: viser.PointCloudHandle) -> None:
+        """Hide what ``add`` returned."""
+        node.visible = False
+        self._free.append(node)
+
+    def remove(self) -> None:
+        """Remove all of them from the scene."""
+        self._root.remove()
 
 
 def place_scan(buffer: TransformBuffer, scan: Scan, target: str) -> NDArray[np.float32]:
