@@ -549,7 +549,7 @@ def test_one_changed_byte_raises_only_message_error(message: Message, at: int, v
     try:
         decode(bytes(payload), encoding_of(type(message)), type(message))
     except MessageError as error:
-        assert error.reason in {"truncated", "malformed"}
+        assert error.reason in {"truncated", "malformed", "foreign"}  # a picture of another format
 
 
 def encoder_of(stream: StreamName, name: str = "") -> StreamEncoder:

@@ -255,14 +255,14 @@ def _start_camera(
         if room is not None:
             walls = wall_surface(room.cells >= OCCUPIED_FROM, room.resolution, room.planar_origin())
             surfaces[_WALLS] = walls
-        source = _RoverCamera(SimulatedCamera(lens, surfaces), rover, model)
+        source = RoverCamera(SimulatedCamera(lens, surfaces), rover, model)
         publisher = CameraPublisher(session, robot, ROVER_CAMERA, lens, program="rover-camera")
         opening.enter_context(publisher)
         _in_thread("rover camera", partial(publisher.run, source, _CAMERA_HZ))
         return opening.pop_all()
 
 
-class _RoverCamera:
+class RoverCamera:
     """A PictureSource: what the camera sees from where the rover truly is."""
 
     def __init__(self, camera: SimulatedCamera, rover: SimulatedRover, model: RobotModel) -> None:
@@ -282,7 +282,8 @@ class _RoverCamera:
         if not self._rover.has_poses_since(joints.stamp):
             return None
         ((x, y, yaw),) = self._rover.poses([joints.stamp]).tolist()
-        world_from_base = Transform.from_rpy(_WORLD, ROVER_BASE, (x, y, 0.0), (0.0, 0.0, yaw))
+        rpy = (0.0, 0.0, math.remainder(yaw, math.tau))  # the rover counts its turns
+        world_from_base = Transform.from_rpy(_WORLD, ROVER_BASE, (x, y, 0.0), rpy)
         lens_from_base = self._base_from_lens.inverse()
         poses: dict[str, NDArray[np.float64]] = {
             link: (lens_from_base @ Transform.from_pose7(ROVER_BASE, "link", pose)).pose7
