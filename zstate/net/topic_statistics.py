@@ -21,6 +21,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.clock import Clock, SystemClock
 from zstate.ingest.deadline import Deadline
+from zstate.net.status import PERIOD_S
 from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
@@ -269,7 +270,12 @@ class TopicStatistics(Closeable):
         return self._statistics.get(source)
 
     def wait(self, sources: Collection[WriterKey], timeout_s: float) -> None:
-        """Wait until each source has 0.2 s of samples, enough for a rate, or for ``timeout_s``."""
+        """Wait until each source has 0.2 s of samples, enough for a rate, or for ``timeout_s``.
+
+        Writers of bulk data state their rate within a second, which is waited for.
+        """
+        if any(is_bulk(source.stream) for source in sources):
+            timeout_s = max(timeout_s, PERIOD_S)
 
         def is_measurable(source: WriterKey) -> bool:
             if is_bulk(source.stream):
