@@ -217,7 +217,10 @@ def test_systemd_ends_and_restarts_a_cell_with_all_its_processes(manager: System
     name = "zstate-up@hall.service"
     with manager:
         manager.systemctl("start", name)
-        with connect(mode="client", endpoints=endpoint) as session, Commander(session, "r1") as commander:
+        with (
+            connect(mode="client", endpoints=endpoint, timeout_s=DEADLINE_S) as session,
+            Commander(session, "r1") as commander,
+        ):
             first = commander.wait_for_driver(DEADLINE_S)
             manager.systemctl("kill", "--kill-whom=main", "--signal=KILL", name)
             second = restarted_driver(commander, first)

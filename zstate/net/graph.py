@@ -67,7 +67,7 @@ class StreamGroup:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """All streams, sorted."""
+    """All streams, by robot; of each those without a writer last."""
 
     streams: tuple[StreamUse, ...] = ()
 
@@ -125,7 +125,7 @@ def build_graph(
     }
     unwritten: dict[str, list[WriterId]] = {"": []}
     uses: list[StreamUse] = []
-    for robot, stream in sorted(used):
+    for robot, stream in sorted(used, key=lambda one: (one[0], one not in written, one[1])):
         reading = programs(
             one.writer for one in readers if one.stream == stream and one.robot in (robot, ANY)
         )
