@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from helpers.pictures import jpeg, png, video
 from helpers.processes import until
+from helpers.robots import wait_for_reader
 from rosbags.highlevel import AnyReader
 
 from zstate import Recorder, Recording
 from zstate.cameras import Camera, CameraPublisher
 from zstate.recording.decode import RecordedWriter
 from zstate.recording.storage import Channel
+from zstate.wire.registry import get_wire
 from zstate.wire.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, COMPRESSED_VIDEO, RosType
 
 STAMP = 1_700_000_000_000_000_000
@@ -34,11 +36,10 @@ def recorded(request, sessions, tmp_path: Path) -> Path:
         def count(stream: str) -> int:
             return recorder.stats.messages.get(("r1", stream), 0)
 
-        until(lambda: publisher.publish(SENT["jpeg"], STAMP - 1) or count("image"))
-        before = count("image")
+        wait_for_reader(writer, get_wire(request.param).expression("r1", "image"))
         for number, (form, data) in enumerate(SENT.items()):
             publisher.publish(data, STAMP + number, format=form if form == "h264" else None)
-        until(lambda: count("image") >= before + 3 and count("camera_info"))
+        until(lambda: count("image") == 3 and count("camera_info"))
     assert not recorder.stats.refused
     return path
 
