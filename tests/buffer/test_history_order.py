@@ -36,7 +36,7 @@ def test_samples_in_any_order_are_sorted_and_leave_earlier_views_unchanged(make:
     kept: dict[int, float] = {}
     views: list[tuple[object, list[int], list[list[float]]]] = []
     front = back = 1000
-    for step in range(1200):
+    for step in range(3000):
         way = choose.random()
         if way < 0.5:
             stamp = front = front - choose.randrange(1, 3)

@@ -74,7 +74,7 @@ def test_a_damaged_file_gives_a_model_or_a_model_error(edits: list[tuple[int, in
 
 
 @given(st.lists(st.recursive(st.just(""), element, max_leaves=8), max_size=8))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=300, deadline=None)
 @pytest.mark.long
 def test_well_formed_nonsense_gives_a_model_or_a_model_error(elements: list[str]):
     parse(f'<robot name="r"><link name="a"/>{"".join(elements)}</robot>')

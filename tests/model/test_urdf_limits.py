@@ -85,7 +85,7 @@ def test_many_faults_take_a_time_that_grows_with_their_number():
         return robot(links + "".join(lost))
 
     assert len(errors(faulty(500))) == 1000
-    assert growth(faulty, 60) < BELOW_QUADRATIC
+    assert growth(faulty, 125) < BELOW_QUADRATIC
 
 
 def test_a_mimic_chain_has_a_limit():

@@ -58,7 +58,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(STEPS)
 @pytest.mark.long
 def test_samples_are_those_of_the_buffer_whatever_clocks_and_writers_do(tmp_path_factory, steps):

@@ -74,7 +74,7 @@ def test_the_pose_moves_as_the_twist_says():
 @pytest.mark.long
 def test_wheels_turn_as_far_as_the_ground_below_them_passes():
     """From the poses alone: each wheel's contact point, its way, and the rotation in that time."""
-    step = PERIOD_NS // 400
+    step = PERIOD_NS // 1600
     for start in range(START, START + 2 * PERIOD_NS, step):
         ways = np.zeros(2)
         fine = [drive().state(start + k * step // 20) for k in range(21)]

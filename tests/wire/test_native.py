@@ -513,8 +513,8 @@ def test_a_deflated_grid_cut_off_anywhere_is_truncated():
 
 @pytest.mark.long
 def test_a_grid_that_inflates_beyond_the_limit_is_refused_without_inflating_it():
-    bomb = zlib.compress(bytes(2**26), 9)
-    assert len(bomb) < 75_000
+    bomb = zlib.compress(bytes(2**28), 9)
+    assert len(bomb) < 300_000
     tracemalloc.start()
     try:
         assert reason(bomb, encoding_of(OccupancyGrid), OccupancyGrid) == "too large"
@@ -549,7 +549,8 @@ def test_one_changed_byte_raises_only_message_error(message: Message, at: int, v
     try:
         decode(bytes(payload), encoding_of(type(message)), type(message))
     except MessageError as error:
-        assert error.reason in {"truncated", "malformed", "foreign"}  # a picture of another format
+        of_another_format = {"foreign"} if isinstance(message, CompressedImage) else set[str]()
+        assert error.reason in {"truncated", "malformed"} | of_another_format
 
 
 def encoder_of(stream: StreamName, name: str = "") -> StreamEncoder:

@@ -109,7 +109,7 @@ def test_no_payload_stops_a_listener_and_all_are_counted(sessions, monkeypatch, 
         wait_for_reader(writer, key_of(topic))
         fuzz = Fuzz(writer, topic)
 
-        @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+        @settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck), database=None)
         @given(broken(WHOLE[topic]), BESIDE)
         def put(payload: bytes, attached: bytes | None) -> None:
             fuzz.put(payload, attached)

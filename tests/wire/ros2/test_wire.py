@@ -245,7 +245,7 @@ def test_any_payload_is_decoded_or_refused_with_a_reason(stream, given_, namespa
         assert isinstance(decoded, tuple)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=400, deadline=None)
 @given(
     st.lists(st.one_of(st.text(max_size=8), st.sampled_from(endpoint(TF, "n").split("/"))), max_size=15).map(
         "/".join
