@@ -209,14 +209,20 @@ class TopicStatistics(Closeable):
         self._arrived = threading.Condition()
         self._subscriptions = ExitStack()
         self._subscribers: list[StreamSubscriber] = []
+        self._statuses: StatusSubscriber | None = None
         self._stated_hz: BoundedDict[tuple[str, int], float] = BoundedDict()
 
-    def watch(self, streams: Iterable[StreamName], robot: str = ANY) -> None:
-        """Count ``streams``; of bulk data take the rates that writers state, so that nothing is received."""
+    def watch(self, streams: Iterable[StreamName]) -> None:
+        """Count ``streams`` of all robots, but for bulk data, whose writers state their rates."""
         for stream in streams:
             if not is_bulk(stream):
-                self.subscribe(stream, robot)
-        self._subscriptions.enter_context(StatusSubscriber(self._session, robot, self._on_status))
+                self.subscribe(stream)
+
+    def _subscribe_statuses(self) -> None:
+        """For the first writer of bulk data: so a fleet without any publishes no status for this."""
+        if self._statuses is None:
+            statuses = StatusSubscriber(self._session, ANY, self._on_status)
+            self._statuses = self._subscriptions.enter_context(statuses)
 
     def _on_status(self, robot: str, status: Status) -> None:
         with self._arrived:
@@ -261,6 +267,7 @@ class TopicStatistics(Closeable):
     def published_hz(self, writer: WriterKey) -> float | None:
         """The rate at which a writer publishes, of bulk data as it states it; None if it is not known."""
         if is_bulk(writer.stream):
+            self._subscribe_statuses()
             return self._stated_hz.get((writer.robot, writer.session))
         counted = self.get(writer)
         return None if counted is None else counted.published_hz()
@@ -275,6 +282,7 @@ class TopicStatistics(Closeable):
         Writers of bulk data state their rate within a second, which is waited for.
         """
         if any(is_bulk(source.stream) for source in sources):
+            self._subscribe_statuses()
             timeout_s = max(timeout_s, PERIOD_S)
 
         def is_measurable(source: WriterKey) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from pathlib import Path
 
@@ -100,10 +101,19 @@ def test_doctor_names_a_sensor_whose_points_are_stamped_by_a_clock_of_its_own(is
 def test_clouds_have_a_rate_and_are_recorded_and_played_again(tmp_path: Path):
     file = str(tmp_path / "run.mcap")
     with connect() as session, published(session) as publisher:
-        with repeated(lambda: publisher.publish(points_at(time.time())), every_s=0.05):
+        sent: list[float] = []
+
+        def publish() -> None:
+            publisher.publish(points_at(time.time()))
+            sent.append(time.monotonic())
+
+        with repeated(publish, every_s=0.05):
+            begin = time.monotonic()
             rate = json.loads(run_cli("hz", "r1", "--stream", "cloud", "--once", "--json").stdout)
-            assert rate["rate_hz"] > 0.0
-            assert "cloud/front" in run_cli("ls").stdout
+            during = [at for at in sent if at > begin]
+            sent_hz = (len(during) - 1) / (during[-1] - during[0])
+            assert rate["rate_hz"] == pytest.approx(sent_hz, rel=0.3)
+            assert re.search(r"cloud/front +[\d.]+ Hz", run_cli("ls").stdout)
             assert run_cli("record", file, "r1", "--seconds", "1").code == 0
         info = run_cli("info", file).stdout
         assert "/front" in info
