@@ -476,8 +476,8 @@ class BaseEstimator:
 
         The displacement since its last one is used, with a constant scale, which is estimated. The target of
         ``world_from_frame`` is any frame, its source one on the robot. ``covariance`` (6, 6), of
-        ``Transform.covariance``, is used as ``noise`` says (by default not), but for one that is none, such
-        as zeros. A displacement that the other sources contradict is rejected, and so a jump does no harm.
+        ``Transform.covariance``, is used if ``noise`` asks for it, and if it is one: zeros are none. A
+        displacement that the other sources contradict is rejected, and so a jump does no harm.
         Raises InvalidInput, which names the source, for NaN and more than 1e8 m; UnknownFrame for the frame.
         """
         checked_vector(world_from_frame.translation, source, "position", MAX_DISTANCE)

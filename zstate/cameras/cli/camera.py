@@ -98,8 +98,8 @@ def camera_command(
     Needs pip install 'zstate[cameras]'.
 
     A simulated camera sees the links of ROBOT, by its transforms on the network, and a checkered floor. It
-    has 640 x 480 pixels and sees 65 degrees, or what --info FILE.yaml says. Its meshes need pip install
-    'zstate[view]'.
+    has 640 x 480 pixels and sees 65 degrees, or the calibration of --info FILE.yaml. Its meshes need
+    pip install 'zstate[view]'.
 
     \b
     zstate camera r1 --device /dev/video0 --name wrist --frame wrist_optical

@@ -20,8 +20,9 @@ from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosTy
 class DisplayedForm(NamedTuple):
     """The form of those messages of a stream that viewers do not display as ROS carries them.
 
-    ``applies(message)`` says which these are. ``type``, ``suffix``, ``encode`` and ``decode`` are as in
-    RosStream. Without ``decode`` recordings have ROS's form, and only viewers of live robots get this one.
+    ``applies(message)`` tells whether a message is one of these. ``type``, ``suffix``, ``encode`` and
+    ``decode`` are as in RosStream. Without ``decode`` recordings have ROS's form, and only viewers of live
+    robots get this one.
     """
 
     type: RosType
