@@ -105,9 +105,12 @@ def assert_only_allowed_writes_arrive(
 
 
 def publish_and_check(publisher: StatePublisher, listener: TransformListener) -> bool:
-    """Publishes a sample of rrbot; whether the listener can look up a moving link."""
+    """Publishes a sample of rrbot; whether the listener can look up a moving link, by full names.
+
+    An edge of another robot's frame ``base`` may have been in the buffer before its owner was known.
+    """
     publisher.publish([0.1, 0.2])
-    return listener.buffer.can_lookup("base", "lower")
+    return listener.buffer.can_lookup(f"{publisher.robot}/base", f"{publisher.robot}/lower")
 
 
 def replies(session: Session, key: str) -> list[str]:
