@@ -176,9 +176,14 @@ def test_large_history_is_received_page_by_page_through_a_router(spawn: Callable
     with (
         connect(mode="client", endpoints=endpoint) as writer,
         connect(mode="client", endpoints=endpoint) as reader,
+        connect(mode="client", endpoints=endpoint) as witness,
         StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher,
     ):
-        publish(publisher, 0, 2000)
+        tap = SampleCollector(witness, JOINTS)
+        wait_for_stream_readers(writer, "r1")
+        for first in range(0, 2000, 100):  # what is still on its way to the router would be received live
+            publish(publisher, first, first + 100)
+            tap.payloads(first + 100)
         with TransformListener(reader, "r1", history_s=100.0) as listener:
             until(lambda: listener.stats.recalled == 2000)
             for number in (0, 1, 1000, 1999):
