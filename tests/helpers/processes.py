@@ -13,7 +13,7 @@ import tempfile
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -47,6 +47,11 @@ def _is_free(port: int) -> bool:
         probe.bind(("127.0.0.1", port))
         return True
     return False
+
+
+def new_threads(earlier: Iterable[threading.Thread]) -> set[threading.Thread]:
+    """The threads of this process that are not among ``earlier`` ones, of which some may have ended."""
+    return set(threading.enumerate()).difference(earlier)
 
 
 def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 from helpers.link_meter import LinkMeter
-from helpers.processes import repeated, until
+from helpers.processes import new_threads, repeated, until
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, TransformBuffer, TransformListener, connect
@@ -96,9 +96,9 @@ def test_joining_a_fleet_costs_the_same_bytes_for_each_robot_of_forty_as_of_ten(
 
 def test_listener_of_several_robots_has_no_more_threads_than_of_two(sessions: tuple[Session, Session]):
     def threads(count: int) -> int:
-        before = threading.active_count()
+        before = threading.enumerate()
         with TransformListener(sessions[1], [f"r{number}" for number in range(count)]):
-            return threading.active_count() - before
+            return len(new_threads(before))
 
     assert threads(20) == threads(2)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.processes import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, new_threads, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, SampleCollector, wait_for_reader, wait_for_stream_readers
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -258,9 +258,9 @@ def test_only_selected_robots_are_recorded_and_a_single_one_in_the_root(sessions
 
 def test_recorder_of_several_robots_has_no_more_threads_than_of_two(sessions, tmp_path: Path):
     def threads(count: int) -> int:
-        before = threading.active_count()
+        before = threading.enumerate()
         with Recorder(sessions[1], tmp_path / f"{count}.mcap", [f"r{number}" for number in range(count)]):
-            return threading.active_count() - before
+            return len(new_threads(before))
 
     assert threads(20) == threads(2)
 

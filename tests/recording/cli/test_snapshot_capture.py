@@ -6,7 +6,7 @@ import threading
 from contextlib import ExitStack
 
 import pytest
-from helpers.processes import repeated
+from helpers.processes import new_threads, repeated
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, StaticPublisher, Transform
@@ -19,11 +19,11 @@ MOUNT = Transform("upper", "camera", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0, 1.0))
 
 def threads_of_a_capture(session: Session, robots: list[str]) -> int:
     """The largest number of additional threads while the robots are captured."""
-    before, most = threading.active_count(), 0
+    before, most = threading.enumerate(), 0
 
     def count() -> None:
         nonlocal most
-        most = max(most, threading.active_count() - before - 1)  # without this thread
+        most = max(most, len(new_threads(before)) - 1)  # without this thread
 
     with repeated(count):
         snapshot = capture(session, SessionOptions(), robots, "native", 10.0)
