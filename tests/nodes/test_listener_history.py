@@ -121,7 +121,8 @@ def test_history_and_live_samples_join_without_a_gap(sessions: tuple[Session, Se
                 answers = [listener.buffer.lookup(*edge, stamp) for listener in (late, early)]
                 assert [answer.kind for answer in answers] == ["exact", "exact"]
                 assert answers[0] == answers[1]
-            assert late.stats.missed == late.stats.dropped == late.stats.late == 0
+            # Zenoh may drop a sample on a link that has just opened (missed); then the history has it.
+            assert late.stats.dropped == late.stats.late == 0
             assert late.stats.recalled >= 300
 
 
