@@ -111,6 +111,7 @@ class ViewServer(Closeable):
             raise
         if not opened:
             self.close()
+            self._socket.close()
             raise RuntimeError("this version of viser opens its server in a way that is not guarded")
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
@@ -134,10 +135,9 @@ class ViewServer(Closeable):
         return time.monotonic() - self._answered_at.get(connection, -math.inf) < _ANSWER_WITHIN_S
 
     def close(self) -> None:
-        """Stop the server. A second call does nothing."""
+        """Stop the server, whose thread closes the socket. A second call does nothing."""
         with _no_output():
             self.server.stop()
-        self._socket.close()
 
     def _update_connected(self) -> None:
         (self.connected.set if self.server.get_clients() else self.connected.clear)()
