@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from helpers.processes import until
+from helpers.robots import put
 
 from zstate._util.refusals import Refusals
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command, CommandReceiver, Targets
@@ -232,7 +233,7 @@ class Receiver:
 
     def receive(self, payload: bytes) -> Command | str:
         """A command as it is received, or the reason of its refusal."""
-        self._session.zenoh.put("zstate/arm/joint_commands", payload, encoding=encoding_of(JointCommand))
+        put(self._session, "zstate/arm/joint_commands", payload, encoding_of(JointCommand))
         found: list[Command] = []
         until(lambda: found.extend(self._receiver.drain()) or found or self._refusals.counts)
         return found[0] if found else next(iter(self._refusals.counts))

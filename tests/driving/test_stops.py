@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from helpers.access_routers import join, router_with_users
 from helpers.processes import DEADLINE_S, repeated, until
-from helpers.robots import RRBOT, wait_for_reader
+from helpers.robots import RRBOT, put, wait_for_reader
 from msgspec.structs import replace
-from zenoh import CongestionControl
 
 from zstate import JointReading
 from zstate._util.refusals import Refusals
@@ -587,7 +586,7 @@ def put_stop(session: Session, number: int, seq: int) -> None:
     """A stop of the session with that number, which is not cached for late joiners."""
     payload = encode(Stop(0, seq, number, "hold", f"flood {seq}"))
     key = STOP.key("arm", WriterId("flood", "desk", 1, 1, number).identity)
-    session.zenoh.put(key, payload, encoding=encoding_of(Stop), congestion_control=CongestionControl.BLOCK)
+    put(session, key, payload, encoding_of(Stop))
 
 
 @pytest.mark.parametrize("kind", ["rising", "distinct"])
@@ -677,9 +676,7 @@ def test_every_name_may_hold_a_driver_and_reads_that_it_has_stopped_and_only_com
             with pytest.raises(Unreachable, match=r"holds its joints, .* 0\.5 s that their torque is off"):
                 stop(users[name], "arm", name, how="relax", timeout_s=0.5)
             payload = encode(Stop(0, 0, 9, "relax", name))
-            users[name].zenoh.put(
-                RELAX.key("arm", local_writer(9).identity), payload, encoding=encoding_of(Stop)
-            )
+            put(users[name], RELAX.key("arm", local_writer(9).identity), payload, encoding_of(Stop))
         assert set(driver.hows) == {"hold"}
         assert not arm.release(DEADLINE_S).stops
         for name in ("teleop", "pendant"):

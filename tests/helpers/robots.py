@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import zenoh
 from helpers.processes import until
 from numpy.typing import ArrayLike, NDArray
 
@@ -35,6 +36,16 @@ def wait_for_stream_readers(session: Session, robot: str, *streams: str) -> None
     """Waits until ``streams`` of ``robot`` have readers; default: joint states."""
     for stream in streams or ("joint_states",):
         wait_for_reader(session, f"zstate/{robot}/{stream}")
+
+
+def put(
+    session: Session, key: str, payload: bytes, encoding: str = "", attachment: bytes | None = None
+) -> None:
+    """Puts a payload that is not dropped on the way, as those on a busy link are otherwise."""
+    blocking = zenoh.CongestionControl.BLOCK
+    session.zenoh.put(
+        key, payload, encoding=encoding or None, attachment=attachment, congestion_control=blocking
+    )
 
 
 class SampleCollector:

@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 import numpy as np
 import pytest
 from helpers.processes import Child, until
-from helpers.robots import RRBOT, wait_for_reader
+from helpers.robots import RRBOT, put, wait_for_reader
 from msgspec.structs import replace
 
 from zstate.errors import Closed, InvalidInput
@@ -211,7 +211,7 @@ def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]
     for robot, identity, status in wrong:
         key = f"zstate/{robot}/status/{identity}"
-        sessions[0].zenoh.put(key, encode(status), encoding=encoding_of(Status))
+        put(sessions[0], key, encode(status), encoding_of(Status))
     until(lambda: sum(received.watch.refused.values()) == len(wrong))
     assert received.watch.refused == {"foreign": 3, "malformed": 1, "too large": 1}
     assert not received.statuses

@@ -10,14 +10,13 @@ from contextlib import ExitStack
 import msgspec
 import numpy as np
 import pytest
-import zenoh
 from helpers.fault_programs import resource_counts
 from helpers.processes import DEADLINE_S, until
+from helpers.robots import put
 from helpers.tokens import current_tokens
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import announce
-from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher
 from zstate.streams import SAMPLE_BYTES
@@ -33,11 +32,6 @@ REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 EDGE = (("odom", "base_link"),)
 CUP = (("odom", "cup"),)
 SESSIONS = 10_000
-
-
-def put(session: Session, payload: bytes) -> None:
-    blocking = zenoh.CongestionControl.BLOCK  # none is dropped on the way
-    session.zenoh.put(KEY, payload, encoding=ENCODING, congestion_control=blocking)
 
 
 def sample(
@@ -111,7 +105,7 @@ def test_unusable_samples_are_refused_with_a_reason_and_move_nothing(sessions, l
     good.publish()
     for reason, payload in garbage():
         before = listener.stats.refused.get(reason, 0)
-        put(sessions[1], payload)
+        put(sessions[1], KEY, payload, ENCODING)
         until(lambda reason=reason, before=before: listener.stats.refused.get(reason, 0) > before)
         good.publish()
     placed = {frame.name for frame in listener.buffer.frames() if frame.parent}
@@ -122,11 +116,11 @@ def test_unusable_samples_are_refused_with_a_reason_and_move_nothing(sessions, l
 def test_edges_of_an_unannounced_writer_yield_to_those_of_an_announced_one(
     sessions, listener, good: GoodWriter
 ):
-    put(sessions[1], sample(rows=[(9.0, *REST[1:])]))
+    put(sessions[1], KEY, sample(rows=[(9.0, *REST[1:])]), ENCODING)
     listener.buffer.wait("odom", "base_link", timeout_s=DEADLINE_S)
     for _ in range(10):
         good.publish()
-        put(sessions[1], sample(rows=[(9.0, *REST[1:])]))
+        put(sessions[1], KEY, sample(rows=[(9.0, *REST[1:])]), ENCODING)
     until(lambda: listener.stats.refused.get("second writer", 0) >= 10)
     good.publish()
 
@@ -136,7 +130,7 @@ def test_ten_thousand_sessions_take_little_memory_and_disturb_no_writer(sessions
     good.publish()
     before = resource_counts()
     for session in range(SESSIONS):
-        put(sessions[1], sample((("odom", f"cup{session}"),), session=session + 1))
+        put(sessions[1], KEY, sample((("odom", f"cup{session}"),), session=session + 1), ENCODING)
         if session % 1000 == 0:
             good.publish()
     until(lambda: listener.stats.received + listener.stats.dropped >= SESSIONS, timeout_s=60.0)

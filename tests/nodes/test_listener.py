@@ -9,7 +9,7 @@ from itertools import count
 import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, Child, until
-from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, wait_for_stream_readers
+from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, put, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import ManualClock
@@ -330,11 +330,11 @@ def test_key_without_a_robot_is_foreign_and_loses_no_sample(sessions):
         for number in range(50):
             for key in strange:
                 state = JointState(STAMP + number, number, 99, order_digest(RRBOT.joint_names), bytes(16))
-                writer.zenoh.put(key, encode(state), encoding=encoding_of(JointState))
+                put(writer, key, encode(state), encoding_of(JointState))
             publisher.publish([0.0, 0.0])
-        writer.zenoh.put("zstate/*/robot_description", b"noise")
-        writer.zenoh.put("zstate/*/tf_static/mount", b"noise")
-        writer.zenoh.put("zstate/r1/tf_static/*", b"noise")
+        put(writer, "zstate/*/robot_description", b"noise")
+        put(writer, "zstate/*/tf_static/mount", b"noise")
+        put(writer, "zstate/r1/tf_static/*", b"noise")
         until(lambda: listener.stats.refused.get("foreign", 0) >= 50 * len(strange) + 3)
         until(lambda: listener.stats.received == 50)
         assert listener.robots() == ("r1",)

@@ -3,9 +3,8 @@ import logging
 import threading
 
 import pytest
-import zenoh
 from helpers.processes import DEADLINE_S, until
-from helpers.robots import RRBOT, wait_for_reader
+from helpers.robots import RRBOT, put, wait_for_reader
 
 from zstate.model.load import load_model
 from zstate.net.session import Session
@@ -23,7 +22,7 @@ FLOATING = load_model(
 )
 
 
-def put(session: Session, payload: bytes, encoding: str = encoding_of(JointState)) -> None:
+def put_sample(session: Session, payload: bytes, encoding: str = encoding_of(JointState)) -> None:
     wait_for_reader(session, KEY)
     with KeyPublisher(session, KEY, encoding) as stream:
         stream.put(payload)
@@ -70,7 +69,7 @@ def test_the_model_is_by_default_that_of_the_description(sessions):
     writer, reader = sessions
     with JointStateListener(reader, "r1") as joints:
         assert joints.model is None
-        put(writer, joint_state([1.0, 2.0]))  # arrives before the description
+        put_sample(writer, joint_state([1.0, 2.0]))  # arrives before the description
         with StatePublisher(writer, RRBOT, "r1") as publisher:
             until(lambda: joints.model is not None)
             publisher.publish([3.0, 4.0], stamp=8)
@@ -139,10 +138,10 @@ def test_unusable_samples_are_counted_and_logged_once_and_the_next_is_read(
 ):
     writer, reader = sessions
     with caplog.at_level(logging.WARNING), JointStateListener(reader, "r1", RRBOT) as source:
-        put(writer, payload, encoding)
-        put(writer, payload, encoding)
+        put_sample(writer, payload, encoding)
+        put_sample(writer, payload, encoding)
         until(lambda: source.refused == {reason: 2})
-        put(writer, joint_state([1.0, 2.0]))
+        put_sample(writer, joint_state([1.0, 2.0]))
         assert next(iter(source)).stamp == 7
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert reason in caplog.text
@@ -155,12 +154,7 @@ def test_samples_that_wait_for_the_model_are_bounded_in_bytes(sessions):
     with JointStateListener(reader, "r1") as source:
         wait_for_reader(writer, KEY)
         for payload in (*[large] * (2 * 2**22 // size), joint_state([1.0, 2.0])):
-            writer.zenoh.put(
-                KEY,
-                payload,
-                encoding=encoding_of(JointState),
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
+            put(writer, KEY, payload, encoding_of(JointState))
 
         def last_is_waiting() -> bool:
             with source._lock:
@@ -190,7 +184,7 @@ def test_the_newest_1024_readings_wait_for_their_reader(sessions):
 def test_a_floating_joint_without_a_unit_quaternion_is_refused_before_republishing(sessions):
     writer, reader = sessions
     with JointStateListener(reader, "r1", FLOATING) as source:
-        put(writer, joint_state([0, 0, 0, 0, 0, 0, 0.5], model=FLOATING))
+        put_sample(writer, joint_state([0, 0, 0, 0, 0, 0, 0.5], model=FLOATING))
         until(lambda: source.refused == {"bad numbers": 1})
 
 

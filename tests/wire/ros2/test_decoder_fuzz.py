@@ -16,7 +16,7 @@ from helpers.raw_ros_nodes import (
     key_of,
     moved,
 )
-from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_reader
+from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, put, wait_for_reader
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -80,7 +80,7 @@ class Fuzz:
 
     def put(self, payload: bytes, attached: bytes | None) -> None:
         key = key_of(self._topic)
-        self._session.zenoh.put(key, payload, attachment=attached)
+        put(self._session, key, payload, attachment=attached)
         try:
             decoded = self._wire.decode(self._topic[0], SerializedSample(key, payload, "", attached), "r1")
         except MessageError:
