@@ -21,7 +21,7 @@ from zstate._util.refusals import Refusals
 from zstate.driving import Commander, DriverHost, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
 from zstate.driving.driver_state import DriverStatePublisher
-from zstate.driving.messages import DriverState, Release, Stop, stop_text
+from zstate.driving.messages import DriverState, Release, Stop, StopIds, stop_text
 from zstate.driving.stops import StopLatch, StopRegister
 from zstate.driving.stops_file import ActiveStop, stops_file, write_stops
 from zstate.errors import AccessDenied, ConfigError, SecondWriter, Unreachable
@@ -754,14 +754,34 @@ def test_a_commander_that_was_stopped_may_move_again_by_a_release_after_that_of_
         with repeated(lambda: arm.send({"elbow": 0.1})):
             until(lambda: host.state == "active")
             state = stop(sessions[1], "arm")
-            releaser = local_writer(8)
-            key = RELEASE.key("arm", releaser.identity)
-            with KeyPublisher(sessions[1], key, encoding_of(Release)) as releases:
-                message = encode(Release(0, 0, releaser.session, state.stops))
-                with repeated(lambda: releases.put(message)):
-                    until(lambda: host.report().refused.get("not released"))
+            release_as(local_writer(8), sessions[1], host, state.stops)
             assert not arm.release().stops
             until(lambda: host.state == "active")
+
+
+def test_a_release_of_stops_that_another_released_a_moment_before_counts(sessions, monkeypatch):
+    with hosted(sessions[0]) as host, Commander(sessions[1], "arm") as arm:
+        arm.wait_for_driver()
+        with repeated(lambda: arm.send({"elbow": 0.1})):
+            until(lambda: host.state == "active")
+            stopped = stop(sessions[1], "arm")
+            until(lambda: host.report().refused.get("stopped"))
+            release_as(local_writer(8), sessions[1], host, stopped.stops)
+            # The driver's state from before that is still in its cache.
+            monkeypatch.setattr("zstate.driving.commander.cached_state", lambda *_: stopped)
+            assert not arm.release(DEADLINE_S).stops
+            until(lambda: host.state == "active")
+
+
+def release_as(releaser: WriterId, session: Session, host: DriverHost, stops: StopIds) -> None:
+    """Release ``stops`` as another program, until commands of the first one are refused for that."""
+    key = RELEASE.key("arm", releaser.identity)
+    message = encode(Release(0, 0, releaser.session, stops))
+    with (
+        KeyPublisher(session, key, encoding_of(Release)) as releases,
+        repeated(lambda: releases.put(message)),
+    ):
+        until(lambda: host.report().refused.get("not released"))
 
 
 def test_a_release_in_the_name_of_another_program_is_refused(sessions):

@@ -29,6 +29,7 @@ from zstate.driving.messages import (
     MotionCancel,
     MotionReply,
     Release,
+    StopIds,
     state_text,
     with_echo,
 )
@@ -287,13 +288,15 @@ class Commander(Closeable):
         # Not the newest state that has arrived here, which may be from before a stop that is confirmed.
         known = cached_state(self._session, self.robot, timeout_s) or self.wait_for_driver(timeout_s)
         while True:
-            with self._lock:
-                self._releases.put(encode(Release(*self._next_head(), known.stops)))
+            self._put_release(known.stops)
             with self._has_changed:
                 self._has_changed.wait(_RELEASE_PERIOD_S)
             state = self.wait_for_driver(timeout_s)
             is_new = state.stamp >= known.stamp and not set(known.stops).intersection(state.stops)
             if is_new and (state.stops or state.state != "stopped"):  # not between the two
+                if known.stops and not state.stops:
+                    # Another one may have released them before; then a release that names none counts.
+                    self._put_release(())
                 return state
             if time.monotonic() > deadline:
                 raise Unreachable(
@@ -301,6 +304,10 @@ class Commander(Closeable):
                     "this program command it (`zstate acl --commander`)?",
                     endpoints=(),
                 )
+
+    def _put_release(self, stops: StopIds) -> None:
+        with self._lock:
+            self._releases.put(encode(Release(*self._next_head(), stops)))
 
     def close(self) -> None:
         """Send no more; the driver holds once the last command has expired, also during a motion.
