@@ -17,14 +17,14 @@ def threads_named(name: str) -> int:
 
 def test_functions_are_called_in_order_and_delayed_ones_when_they_are_due(sessions):
     called: list[str] = []
-    start_s = time.monotonic()
     with ServiceThread(sessions[0], "test") as thread:
-        thread.call(lambda: called.append("later"), 0.06)
-        thread.call(lambda: called.append("soon"), 0.03)
         for name in ("first", "second"):
             thread.call(lambda name=name: called.append(name))
+        start_s = time.monotonic()
+        thread.call(lambda: called.append("later"), 0.5)
+        thread.call(lambda: called.append("soon"), 0.01)
         until(lambda: len(called) == 4)
-        assert time.monotonic() >= start_s + 0.06
+        assert time.monotonic() >= start_s + 0.5
     assert called == ["first", "second", "soon", "later"]
 
 
