@@ -66,6 +66,7 @@ HOMES = {
     "xxhash": "wire",
     "mcap": "recording",
     "pyarrow": "recording",  # `zstate export`
+    "duckdb": "archive",
     "lz4": "recording",
     "zstandard": "recording",
     "rospy": "bridges",
@@ -100,6 +101,7 @@ GUESTS = {
     ("cli/up/cell.py", "msgspec"),
     ("cli/up/command_table.py", "msgspec"),
     ("driving/cli/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
+    ("archive/storage.py", "pyarrow"),
     ("clouds/compression.py", "lz4"),
     ("clouds/compression.py", "zstandard"),
     ("cameras/simulated_camera.py", "PIL"),

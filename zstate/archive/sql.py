@@ -1,0 +1,102 @@
+"""SQL on an archive, by DuckDB: a view of each stream and table, and poses.
+
+==================  ====================================================================================
+view                rows
+==================  ====================================================================================
+``joint_states``    and so on, one of each stream: the columns of its files (``zstate.archive.layout``), then
+                    ``robot``, ``date`` and ``time``, a timestamp of ``stamp``
+``frames``          static edges and models, by ``robot``
+``writers``         the writers of each recording, by ``robot``
+``models``          the URDFs, by ``digest``
+``files``           what each import has added: ``rows`` by ``robot`` and ``date``
+==================  ====================================================================================
+
+``zstate_pose(robot, target, source, stamp)`` is the pose of a frame, a struct of x y z [m], qx qy qz qw, as
+``Archive.lookup_many`` returns it; NULL where there is none. Select by ``robot`` and ``date``: only folders
+of these are read then. Views also show the files of an import that is under way, or was interrupted.
+"""
+
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyarrow has no annotations
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zstate.archive.batches import lookup_rows
+from zstate.archive.layout import FRAMES, IMPORTS, MODELS, POSE, WRITERS, folder_of, value_of
+from zstate.archive.storage import Store, arrow
+from zstate.errors import LibraryMissing
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
+    from zstate.archive.archive import Archive
+
+_TABLES = {"files": IMPORTS, "frames": FRAMES, "models": MODELS, "writers": WRITERS}
+
+
+def connect(archive: Archive) -> DuckDBPyConnection:
+    """A connection in memory, with the views of ``archive``. Raises LibraryMissing without DuckDB."""
+    try:
+        import duckdb  # noqa: PLC0415 - an extra
+        from duckdb.func import PythonUDFType  # noqa: PLC0415
+    except ImportError as error:
+        raise LibraryMissing(
+            f"SQL needs duckdb, which cannot be loaded ({error}): pip install 'zstate[archive]'"
+        ) from None
+    connection = duckdb.connect()
+    store = Store(archive.url)
+    for name, table in _TABLES.items():
+        _add_view(connection, store, name, folder_of(table), "*")
+    for folder in store.folders(""):
+        if folder.startswith("stream="):
+            _add_view(connection, store, value_of(folder), folder, "make_timestamp_ns(stamp) AS time, *")
+    poses = ", ".join(f"{name} DOUBLE" for name in POSE)
+    connection.create_function(
+        "zstate_pose",
+        _PoseFunction(archive),
+        [duckdb.sqltype(name) for name in ("VARCHAR", "VARCHAR", "VARCHAR", "BIGINT")],
+        duckdb.sqltype(f"STRUCT({poses})"),
+        type=PythonUDFType.ARROW,
+    )
+    return connection
+
+
+class _PoseFunction:
+    """Poses of columns of robots, targets, sources and stamps, as a column of structs."""
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+
+    def __call__(self, robots: Any, targets: Any, sources: Any, stamps: Any) -> Any:
+        pa = arrow()
+        times = np.asarray(stamps, np.int64)
+        poses = np.full((len(times), 7), np.nan)
+        pairs = np.array([*zip(targets.to_pylist(), sources.to_pylist(), strict=True)])
+        for target, source in np.unique(pairs, axis=0).tolist():
+            rows = np.flatnonzero((pairs == (target, source)).all(axis=1))
+            names = np.asarray(robots.take(pa.array(rows)))
+            poses[rows] = lookup_rows(self._archive, names, target, source, times[rows])
+        columns = [pa.array(np.ascontiguousarray(column)) for column in poses.T]
+        return pa.StructArray.from_arrays(columns, POSE, mask=pa.array(np.isnan(poses[:, 0])))
+
+
+def _add_view(connection: Any, store: Store, name: str, folder: str, columns: str) -> None:
+    """A view of all files in ``folder``; none without a file."""
+    if not store.files(folder):
+        return
+    quoted = '"' + name.replace('"', '""') + '"'
+    if store.is_local:  # DuckDB reads the files itself
+        pattern = f"{store.root}/{folder}/**/*.parquet".replace("'", "''")
+        source = f"read_parquet('{pattern}', hive_partitioning = true, union_by_name = true)"
+    else:
+        dataset = arrow().dataset.dataset(
+            f"{store.root}/{folder}", filesystem=store.filesystem, partitioning="hive", format="parquet"
+        )
+        schemas = [dataset.schema, *(one.physical_schema for one in dataset.get_fragments())]
+        source = f'"{name} files"'
+        connection.register(f"{name} files", dataset.replace_schema(arrow().unify_schemas(schemas)))
+    connection.execute(f"CREATE VIEW {quoted} AS SELECT {columns} FROM {source}")
