@@ -35,17 +35,18 @@ class _ArchiveGroup(click.Group):
     """A group whose option --from has one or more values, as a shell makes of ``*.mcap``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        words: list[str] = []
+        recordings: list[str] = []
+        rest: list[str] = []
         is_from = False
         for word in args:
-            if word == "--from" or word.startswith("-"):
+            if word.startswith("-"):
                 is_from = word == "--from"
-                words += [] if is_from else [word]
-            else:
-                words += ["--from", word] if is_from else [word]
-        if "--from" in args and "--from" not in words:
+            if word != "--from":
+                (recordings if is_from else rest).append(word)
+        if "--from" in args and not recordings:
             raise click.UsageError("Option '--from' requires at least one RECORDING.", ctx)
-        return super().parse_args(ctx, words)
+        # A group takes its options before its arguments.
+        return super().parse_args(ctx, [*(one for name in recordings for one in ("--from", name)), *rest])
 
 
 @click.group("archive", cls=_ArchiveGroup, invoke_without_command=True)
