@@ -21,7 +21,7 @@ from zstate.plugins import built_in_plugins
 PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # The plugins that stand on others; below the rest is only the core.
-_ABOVE = {"recording", "bridges", "metrics", "foxglove", "view"}
+_ABOVE = {"archive", "recording", "bridges", "metrics", "foxglove", "view"}
 _PLUGINS = {plugin.name for plugin in built_in_plugins()}
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
@@ -40,6 +40,7 @@ FLOORS = (
     {"nodes"},
     _PLUGINS - _ABOVE,
     {"bridges", "recording"},
+    {"archive"},
     {"zstate"},
     {"metrics", "foxglove"},
     {"view", "cli"},

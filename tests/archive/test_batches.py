@@ -57,7 +57,7 @@ def test_poses_do_not_depend_on_how_rows_are_cut(archive: Archive, expected: np.
 
 
 def test_poses_do_not_depend_on_the_order_of_rows(archive: Archive, expected: np.ndarray):
-    function = archive.poses("world", "tip")
+    function = poses("world", "tip", archive=archive.url)
     order = np.random.default_rng(3).permutation(len(expected))
     found = [function(rows_of(archive).take(part)) for part in np.array_split(order, 5)]
     assert np.array_equal(matrix(pa.concat_tables(found)), expected[order], equal_nan=True)
@@ -65,9 +65,9 @@ def test_poses_do_not_depend_on_the_order_of_rows(archive: Archive, expected: np
 
 def test_batches_without_robots_and_unknown_frames_are_named(archive: Archive):
     with pytest.raises(InvalidInput, match="the batch has stamp"):
-        archive.poses("world", "tip")(pa.table({"stamp": [MIDNIGHT]}))
+        poses("world", "tip", archive=archive.url)(pa.table({"stamp": [MIDNIGHT]}))
     with pytest.raises(UnknownFrame, match="nowhere"):
-        archive.poses("world", "nowhere")(rows_of(archive))
+        poses("world", "nowhere", archive=archive.url)(rows_of(archive))
 
 
 def test_sql_has_views_and_poses(archive: Archive, expected: np.ndarray):

@@ -19,8 +19,9 @@ two recordings of the same time         one history; of samples with one stamp t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -190,7 +191,7 @@ class Archive:
     def lookup_many(
         self, target: str, source: str, stamps: ArrayLike, *, robot: str
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The pose of ``source`` in ``target`` at each stamp: pose7 (T, 7), and which are valid, (T,).
+        """The pose of ``source`` in ``target`` at ``stamps``: pose7 (T, 7), and which are valid, (T,).
 
         Both are as those of ``Recording(path, robot).lookup_many``, of all recordings of ``robot``. Stamps
         [ns] may be in any order, months apart: of each file only row groups around them are read, and of
@@ -222,7 +223,7 @@ class Archive:
         return poses[rows], valid[rows]
 
     def messages(self, robot: str, stream: str, start: int, end: int) -> Iterator[ArchivedMessage]:
-        """The messages of ``stream`` of ``robot`` with stamps in [start, end) [ns], as they were recorded.
+        """The messages of ``stream`` of ``robot`` with stamps in ``[start, end)`` [ns], as recorded.
 
         Of streams that are not joint states or transforms. Raises InvalidInput for one that no plugin brings.
         """
@@ -246,17 +247,11 @@ class Archive:
                         raise InvalidInput(f"{stream} of {robot!r}: {error}") from None
                     yield ArchivedMessage(row["name"], message, row["log_time"])
 
-    def poses(self, target: str, source: str) -> Callable[[Any], Any]:
-        """``zstate.archive.poses(target, source, archive=url)`` of this archive."""
-        from zstate.archive.batches import poses  # noqa: PLC0415 - which imports this module
-
-        return poses(target, source, archive=self.url)
-
     def duckdb(self) -> DuckDBPyConnection:
         """A DuckDB connection with views of the archive, and ``zstate_pose``; see ``zstate.archive.sql``."""
         from zstate.archive.sql import connect  # noqa: PLC0415 - an extra
 
-        return connect(self)
+        return connect(self._files.store, partial(lookup_rows, self))
 
     def _imports_of(self, robot: str) -> list[str]:
         names = self._files.store.names(folder_of(WRITERS, robot))
@@ -418,3 +413,25 @@ def _covariances(table: Any) -> NDArray[np.float64] | None:
     is_known = column.is_valid().to_numpy(zero_copy_only=False)
     rows[is_known] = np.array(column.drop_null().flatten().to_numpy(zero_copy_only=False)).reshape(-1, 21)
     return rows
+
+
+def lookup_rows(
+    archive: Archive, robots: NDArray[Any], target: str, source: str, stamps: Stamps
+) -> NDArray[np.float64]:
+    """The pose (T, 7) at each stamp of the robot in the same row; NaN where there is none.
+
+    Frames that one of the robots does not have are unknown there. Raises LookupFailed if none has them.
+    """
+    found = np.full((len(stamps), 7), np.nan)
+    failure: LookupFailed | None = None
+    is_known = False
+    for robot in np.unique(robots).tolist():
+        rows = np.flatnonzero(robots == robot)
+        try:
+            found[rows] = archive.lookup_many(target, source, stamps[rows], robot=robot)[0]
+            is_known = True
+        except LookupFailed as error:
+            failure = error
+    if failure is not None and not is_known:
+        raise failure
+    return found

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from zstate.archive.archive import Archive
+from zstate.archive.archive import Archive, lookup_rows
 from zstate.archive.layout import POSE
 from zstate.archive.storage import arrow
-from zstate.errors import InvalidInput, LookupFailed
+from zstate.errors import InvalidInput
 
 
 @lru_cache(maxsize=4)
@@ -80,25 +80,3 @@ def poses(target: str, source: str, *, archive: str) -> PoseColumns:
     opens the archive. Raises InvalidInput for a batch without these columns.
     """
     return PoseColumns(archive, target, source)
-
-
-def lookup_rows(
-    archive: Archive, robots: np.ndarray[Any, Any], target: str, source: str, stamps: np.ndarray[Any, Any]
-) -> np.ndarray[Any, Any]:
-    """The pose (T, 7) at each stamp of the robot in the same row; NaN where there is none.
-
-    Frames that one of the robots does not have are unknown there. Raises LookupFailed if none has them.
-    """
-    found = np.full((len(stamps), 7), np.nan)
-    failure: LookupFailed | None = None
-    is_known = False
-    for robot in np.unique(robots).tolist():
-        rows = np.flatnonzero(robots == robot)
-        try:
-            found[rows] = archive.lookup_many(target, source, stamps[rows], robot=robot)[0]
-            is_known = True
-        except LookupFailed as error:
-            failure = error
-    if failure is not None and not is_known:
-        raise failure
-    return found

@@ -118,7 +118,7 @@ def import_recording(
             one = _RobotImport(path, robot, decoded, new_path.__next__, report.refused)
             for text in one.run():
                 on_progress(text)
-            rows += _listed(one.files, one.scene, pending, name)
+            rows += listed(one.files, one.scene, pending, name)
             pending |= one.small_files(store, name)
         for row in rows:
             row |= {"recording": str(Path(path).name), "recorded": span[0] if span else 0}
@@ -134,7 +134,7 @@ def import_recording(
     return report
 
 
-def _listed(
+def listed(
     files: Iterable[WrittenFile], scene: str, pending: dict[str, Path], name: str
 ) -> Iterator[dict[str, Any]]:
     """The rows of the import's record of ``files``, which get their places in ``pending``."""
@@ -151,7 +151,7 @@ def _listed(
         }
 
 
-class _Table:
+class SampleTable:
     """The samples of one stream, robot and key, in a file for each date; they may begin again."""
 
     def __init__(self, new_path: NewPath, stream: str, robot: str, key: str) -> None:
@@ -230,7 +230,7 @@ class _RobotImport:
         self._path, self._robot, self._new_path, self._refused = path, robot, new_path, refused
         self._writers = {one: number for one, number in decoded.writers.items() if one.robot == robot}
         self._streams = {one.stream for one in decoded.writers_of((robot,))} - {"clock"}
-        self._tables: dict[tuple[str, str], _Table] = {}
+        self._tables: dict[tuple[str, str], SampleTable] = {}
         self._taken: dict[tuple[str, str], _Taken] = {}
         self._frames: list[dict[str, Any]] = []
         self._model: RobotModel | None = None
@@ -256,9 +256,9 @@ class _RobotImport:
         rows = sorted(json.dumps(row, sort_keys=True) for row in self._frames)
         self.scene = bytes_digest("\n".join(rows).encode())
 
-    def _table(self, stream: str, key: str = "") -> _Table:
+    def _table(self, stream: str, key: str = "") -> SampleTable:
         if (stream, key) not in self._tables:
-            self._tables[stream, key] = _Table(self._new_path, stream, self._robot, key)
+            self._tables[stream, key] = SampleTable(self._new_path, stream, self._robot, key)
         return self._tables[stream, key]
 
     def _add_batches(self, reader: RecordedJointReader) -> Iterator[str]:

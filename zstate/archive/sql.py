@@ -21,11 +21,12 @@ of these are read then. Views also show the files of an import that is under way
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from zstate.archive.batches import lookup_rows
 from zstate.archive.layout import FRAMES, IMPORTS, MODELS, POSE, WRITERS, folder_of, value_of
 from zstate.archive.storage import Store, arrow
 from zstate.errors import LibraryMissing
@@ -33,13 +34,17 @@ from zstate.errors import LibraryMissing
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
-    from zstate.archive.archive import Archive
+Lookup: TypeAlias = Callable[[NDArray[Any], str, str, NDArray[np.int64]], NDArray[np.float64]]
+"""Poses of one frame in another, at the stamps [ns] of robots: (T, 7), NaN where there is none."""
 
 _TABLES = {"files": IMPORTS, "frames": FRAMES, "models": MODELS, "writers": WRITERS}
 
 
-def connect(archive: Archive) -> DuckDBPyConnection:
-    """A connection in memory, with the views of ``archive``. Raises LibraryMissing without DuckDB."""
+def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
+    """A connection in memory, with views of the files in ``store``, and ``lookup`` as ``zstate_pose``.
+
+    Raises LibraryMissing without DuckDB.
+    """
     try:
         import duckdb  # noqa: PLC0415 - an extra
         from duckdb.func import PythonUDFType  # noqa: PLC0415
@@ -48,7 +53,6 @@ def connect(archive: Archive) -> DuckDBPyConnection:
             f"SQL needs duckdb, which cannot be loaded ({error}): pip install 'zstate[archive]'"
         ) from None
     connection = duckdb.connect()
-    store = Store(archive.url)
     for name, table in _TABLES.items():
         _add_view(connection, store, name, folder_of(table), "*")
     for folder in store.folders(""):
@@ -57,7 +61,7 @@ def connect(archive: Archive) -> DuckDBPyConnection:
     poses = ", ".join(f"{name} DOUBLE" for name in POSE)
     connection.create_function(
         "zstate_pose",
-        _PoseFunction(archive),
+        _PoseFunction(lookup),
         [duckdb.sqltype(name) for name in ("VARCHAR", "VARCHAR", "VARCHAR", "BIGINT")],
         duckdb.sqltype(f"STRUCT({poses})"),
         type=PythonUDFType.ARROW,
@@ -68,8 +72,8 @@ def connect(archive: Archive) -> DuckDBPyConnection:
 class _PoseFunction:
     """Poses of columns of robots, targets, sources and stamps, as a column of structs."""
 
-    def __init__(self, archive: Archive) -> None:
-        self._archive = archive
+    def __init__(self, lookup: Lookup) -> None:
+        self._lookup = lookup
 
     def __call__(self, robots: Any, targets: Any, sources: Any, stamps: Any) -> Any:
         pa = arrow()
@@ -79,7 +83,7 @@ class _PoseFunction:
         for target, source in np.unique(pairs, axis=0).tolist():
             rows = np.flatnonzero((pairs == (target, source)).all(axis=1))
             names = np.asarray(robots.take(pa.array(rows)))
-            poses[rows] = lookup_rows(self._archive, names, target, source, times[rows])
+            poses[rows] = self._lookup(names, target, source, times[rows])
         columns = [pa.array(np.ascontiguousarray(column)) for column in poses.T]
         return pa.StructArray.from_arrays(columns, POSE, mask=pa.array(np.isnan(poses[:, 0])))
 
