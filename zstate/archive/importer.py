@@ -58,7 +58,6 @@ from zstate.recording.reader import RecordingReader
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.recording.stream_export import plain_columns
 from zstate.streams import JOINT_STREAMS, StreamName
-from zstate.transform import COVARIANCE_NUMBERS
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import encode, encoding_of
 
@@ -434,10 +433,8 @@ def _named_row(kind: str, parent: str, child: str, model: str | None) -> dict[st
 def _covariance_column(triangles: NDArray[np.float64] | None, count: int) -> Any:
     """The upper triangles (T, 21) as a column of lists; null where they are not known."""
     pa = arrow()
-    kind = pa.list_(pa.float64(), COVARIANCE_NUMBERS)
     if triangles is None:
-        return pa.nulls(count, kind)
-    numbers = pa.array(np.ascontiguousarray(triangles).ravel())
-    return pa.FixedSizeListArray.from_arrays(
-        numbers, type=kind, mask=pa.array(np.isnan(triangles).all(axis=1))
-    )
+        return pa.nulls(count, pa.list_(pa.float64()))
+    is_known = ~np.isnan(triangles).all(axis=1)
+    ends = np.concatenate(([0], np.cumsum(is_known * triangles.shape[1]))).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(ends), triangles[is_known].ravel(), mask=pa.array(~is_known))

@@ -47,7 +47,6 @@ def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
     """
     try:
         import duckdb  # noqa: PLC0415 - an extra
-        from duckdb.func import PythonUDFType  # noqa: PLC0415
     except ImportError as error:
         raise LibraryMissing(
             f"SQL needs duckdb, which cannot be loaded ({error}): pip install 'zstate[archive]'"
@@ -59,13 +58,9 @@ def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
         if folder.startswith("stream="):
             _add_view(connection, store, value_of(folder), folder, "make_timestamp_ns(stamp) AS time, *")
     poses = ", ".join(f"{name} DOUBLE" for name in POSE)
-    connection.create_function(
-        "zstate_pose",
-        _PoseFunction(lookup),
-        [duckdb.sqltype(name) for name in ("VARCHAR", "VARCHAR", "VARCHAR", "BIGINT")],
-        duckdb.sqltype(f"STRUCT({poses})"),
-        type=PythonUDFType.ARROW,
-    )
+    create_function: Any = connection.create_function  # its annotations are others in each version
+    parameters = ["VARCHAR", "VARCHAR", "VARCHAR", "BIGINT"]
+    create_function("zstate_pose", _PoseFunction(lookup), parameters, f"STRUCT({poses})", type="arrow")
     return connection
 
 
