@@ -81,12 +81,8 @@ class Files:
         """A table that fits into memory, a pyarrow.Table."""
         with self.store.opened(path) as file:
             opened = arrow().parquet.ParquetFile(file, page_checksum_verification=True)
-            check_version(opened.metadata.metadata, self.where(path))
+            check_version(opened.metadata.metadata, self.store.where(path))
             return opened.read()
-
-    def where(self, path: str) -> str:
-        """A file as errors name it."""
-        return f"{self.store.url.rstrip('/')}/{path}"
 
     def dates(self, stream: str, robot: str) -> list[str]:
         """The dates with samples of a robot."""
@@ -138,7 +134,7 @@ class Files:
         if entry.path not in self._footers:
             with self.store.opened(entry.path) as file:
                 footer = arrow().parquet.read_metadata(file)
-            check_version(footer.metadata, self.where(entry.path))
+            check_version(footer.metadata, self.store.where(entry.path))
             self._footers[entry.path] = footer
         return self._footers[entry.path]
 
@@ -154,7 +150,7 @@ class Files:
 
     def missing(self, entry: Entry) -> RecordingError:
         """The error for a file that its import lists, and that is not there."""
-        where = self.where(entry.path)
+        where = self.store.where(entry.path)
         return RecordingError(f"{where!r} is missing; `zstate archive` adds its recording again", path=where)
 
 

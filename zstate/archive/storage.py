@@ -65,6 +65,10 @@ class Store:
         """Whether it is a folder of this machine."""
         return self.filesystem.type_name == "local"
 
+    def where(self, path: str) -> str:
+        """A file as errors name it."""
+        return f"{self.url.partition('?')[0].rstrip('/')}/{path}"
+
     def files(self, folder: str = "") -> list[StoredFile]:
         """All files below ``folder``, by path."""
         found = self._infos(folder, recursive=True)
@@ -153,7 +157,7 @@ class Store:
 
     @contextmanager
     def _errors(self, path: str) -> Generator[None, None, None]:
-        where = f"{self.url.rstrip('/')}/{path}"
+        where = self.where(path)
         try:
             yield
         except arrow().ArrowInvalid as error:
