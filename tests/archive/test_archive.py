@@ -20,7 +20,8 @@ from recording.test_recording import wild
 
 from zstate import Archive, Recording, UnknownFrame
 from zstate.archive import import_recording
-from zstate.errors import InvalidInput
+from zstate.archive.cut import cut
+from zstate.errors import InvalidInput, RecordingError
 from zstate.odometry.messages import Imu
 from zstate.recording.decode import DecodedMessage
 from zstate.wire.messages import to_block
@@ -201,6 +202,33 @@ def test_messages_of_other_streams_come_back_as_they_were_recorded(tmp_path: Pat
     window = [one.message.stamp for one in archive.messages("r1", "imu", MIDNIGHT, MIDNIGHT + 200 * MS)]
     stamps = [one.message.stamp for one in expected]
     assert window == [stamp for stamp in stamps if MIDNIGHT <= stamp < MIDNIGHT + 200 * MS]
+
+
+def test_a_window_becomes_a_recording_with_the_same_answers(tmp_path: Path):
+    tour(tmp_path / "r.mcap", MIDNIGHT - 2 * S, MIDNIGHT + 2 * S)
+    url, path = str(tmp_path / "a"), tmp_path / "window.mcap"
+    import_recording(url, tmp_path / "r.mcap")
+    start, end = MIDNIGHT - S, MIDNIGHT + S
+    written = cut(url, path, "arm", start, end)
+    assert written["joint_states"] == 101
+    assert not [name for name in written if "not written" in name]
+    stamps = np.arange(start + 100 * MS, end - 100 * MS, 3 * MS)
+    with Recording(path) as window, Recording(tmp_path / "r.mcap", "arm") as recording:
+        assert window.robots == ("arm",)
+        assert_same_joint_states(Archive(url), window, start, end)
+        for target, source in PAIRS:
+            poses, valid = recording.lookup_many(target, source, stamps)
+            found, is_found = window.lookup_many(target, source, stamps)
+            assert valid.all()
+            assert is_found.all()
+            assert np.array_equal(found, poses)
+        instant = int(stamps[7])
+        one, other = (each.buffer().lookup("map", "world", instant) for each in (window, recording))
+        assert one.covariance is None or np.array_equal(one.covariance, other.covariance)
+    with pytest.raises(RecordingError, match="exists"):
+        cut(url, path, "arm", start, end)
+    with pytest.raises(InvalidInput, match="no recording"):
+        cut(url, tmp_path / "x.mcap", "arm", start + DAY, end + DAY)
 
 
 def test_unknown_robots_and_frames_and_empty_windows_are_named(tmp_path: Path):

@@ -31,6 +31,21 @@ def test_recordings_are_added_once_and_listed_by_robot(tmp_path: Path):
     assert re.fullmatch(r"arm +2 +2023-11-15 00:00:00 +2023-11-15 00:00:02 +\d+", row)
 
 
+def test_a_minute_of_the_archive_is_a_recording_for_all_other_commands(tmp_path: Path):
+    tour(tmp_path / "r.mcap", MIDNIGHT + 30 * S, MIDNIGHT + 31 * S)
+    url, minute = str(tmp_path / "a"), str(tmp_path / "minute.mcap")
+    assert run_cli("archive", url, "--from", str(tmp_path / "r.mcap")).code == 0
+    written = run_cli("archive", url, "cut", minute, "arm", "--at", "2023-11-15T00:00").stdout
+    assert "50 joint_states" in written.replace("\n", " ")
+    assert "arm" in run_cli("info", minute).stdout
+    assert "exists" in failure("archive", url, "cut", minute, "arm", "--at", "2023-11-15T00:00")
+    half = str(tmp_path / "half.mcap")
+    stamps = ("--from", "2023-11-15T00:00:30", "--to", str(MIDNIGHT + 30 * S + S // 2))
+    assert "26 joint_states" in run_cli("archive", url, "cut", half, "arm", *stamps).stdout.replace("\n", " ")
+    assert "--from TIME --to TIME" in failure("archive", url, "cut", half, "arm", code=2)
+    assert "no time like" in failure("archive", url, "cut", half, "arm", "--at", "noon", code=2)
+
+
 def test_a_recording_that_cannot_be_added_is_named_and_the_others_are_in(tmp_path: Path):
     tour(tmp_path / "good.mcap", MIDNIGHT, MIDNIGHT + S)
     (tmp_path / "bad.mcap").write_bytes(b"nothing")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from zstate.archive.importer import ImportReport
 
 _LINE_S = 2.0
+_MINUTE_NS = 60 * 10**9
 _DAYS = {"d": 1, "w": 7}
 
 
@@ -31,6 +33,19 @@ def _date_before(text: str) -> str:
         raise InvalidInput(f"{text!r} is no date like 2026-08-01, and no time like 90d or 12w") from None
 
 
+def _stamp(text: str) -> int:
+    """The stamp [ns] of ``text``: UTC in ISO 8601, or itself."""
+    if re.fullmatch(r"\d{15,19}", text, re.ASCII):
+        return int(text)
+    try:
+        seconds = datetime.fromisoformat(text)
+    except ValueError:
+        raise InvalidInput(f"{text!r} is no time like 2026-11-20T14:03, and no stamp [ns]") from None
+    if seconds.tzinfo is None:
+        seconds = seconds.replace(tzinfo=UTC)
+    return (seconds - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+
+
 class _ArchiveGroup(click.Group):
     """A group whose option --from has one or more values, as a shell makes of ``*.mcap``."""
 
@@ -39,11 +54,12 @@ class _ArchiveGroup(click.Group):
         rest: list[str] = []
         is_from = False
         for word in args:
+            is_of_command = len(rest) > 1  # behind the archive and the command
             if word.startswith("-"):
-                is_from = word == "--from"
-            if word != "--from":
+                is_from = word == "--from" and not is_of_command
+            if word != "--from" or is_of_command:
                 (recordings if is_from else rest).append(word)
-        if "--from" in args and not recordings:
+        if "--from" in args and "--from" not in rest and not recordings:
             raise click.UsageError("Option '--from' requires at least one RECORDING.", ctx)
         # A group takes its options before its arguments.
         return super().parse_args(ctx, [*(one for name in recordings for one in ("--from", name)), *rest])
@@ -66,6 +82,7 @@ def archive_command(context: click.Context, *, url: str, recordings: tuple[str, 
     zstate archive fleet --from monday/*.mcap           # add recordings
     zstate archive fleet                                # robots, and since when
     zstate archive s3://plant/fleet --from run.mcap
+    zstate archive fleet cut minute.mcap robot17 --at 2026-11-20T14:03   # for view, plot, export, replay
     zstate archive fleet check                          # checksums of all files
     zstate archive fleet expire --before 90d
     zstate archive fleet forget robot17
@@ -144,6 +161,40 @@ def _show(url: str) -> None:
 
 def _date_text(stamp: int) -> str:
     return f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+@archive_command.command("cut")
+@click.argument("file", metavar="FILE")
+@click.argument("robot")
+@click.option("--at", "at", type=options.Checked("TIME", _stamp), help="The minute that begins then.")
+@click.option("--from", "start", type=options.Checked("TIME", _stamp), help="From this time on.")
+@click.option("--to", "end", type=options.Checked("TIME", _stamp), help="Up to this time.")
+@click.pass_obj
+def cut_command(
+    url: str, *, file: str, robot: str, at: int | None, start: int | None, end: int | None
+) -> None:
+    """Write a window of ROBOT as a recording, which view, plot, export, replay and info open.
+
+    A TIME is UTC as 2026-11-20T14:03, 2026-11-20T14:03:05.25, or a stamp in nanoseconds.
+
+    \b
+    zstate archive fleet cut minute.mcap robot17 --at 2026-11-20T14:03
+    zstate archive fleet cut run.mcap robot17 --from 2026-11-20T14:00 --to 2026-11-20T14:10
+    zstate view minute.mcap
+    """
+    from zstate.archive.cut import cut
+    from zstate.errors import RecordingError
+
+    if at is not None and start is None and end is None:
+        start, end = at, at + _MINUTE_NS
+    elif at is not None or start is None or end is None:
+        raise click.UsageError("name the window by --at TIME, or by --from TIME --to TIME")
+    try:
+        written = cut(url, Path(file), robot, start, end)
+    except RecordingError as error:
+        fail(str(error))
+    counts = ", ".join(f"{count} {stream}" for stream, count in sorted(written.items()))
+    print_wrapped(f"wrote {file}: {counts}")
 
 
 @archive_command.command("check")
