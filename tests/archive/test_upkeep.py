@@ -152,6 +152,29 @@ def test_each_file_that_cannot_be_used_is_named_and_costs_only_itself(tmp_path: 
         archive.joint_states("r1", MIDNIGHT, MIDNIGHT + S)
 
 
+def test_a_damaged_file_is_repaired_by_its_recording(tmp_path: Path, recording: Path):
+    url = str(tmp_path / "a")
+    import_recording(url, recording)
+    before = files_of(tmp_path / "a")
+    file = next((tmp_path / "a").glob("stream=transforms/*/*/*"))
+    file.write_bytes(b"PAR1")
+    ((path, problem),) = check(url)
+    assert path == str(file.relative_to(tmp_path / "a"))
+    record = tmp_path / "a" / problem.partition("remove ")[2].partition(" and add 'r.mcap'")[0]
+    record.unlink()
+    import_recording(url, recording)
+    assert files_of(tmp_path / "a") == before
+    assert list(check(url)) == []
+
+
+def test_a_recording_that_is_not_complete_is_refused(tmp_path: Path, recording: Path):
+    content = recording.read_bytes()
+    recording.write_bytes(content[: len(content) * 3 // 4])
+    with pytest.raises(RecordingError, match="zstate recover"):
+        import_recording(str(tmp_path / "a"), recording)
+    assert not (tmp_path / "a").exists()
+
+
 def test_expired_days_are_gone_and_their_recordings_can_be_added_again(tmp_path: Path):
     url = fleet(tmp_path, ("r1", "r2"), days=3)
     removed = expire(url, "2023-11-16")

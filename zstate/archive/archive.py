@@ -258,7 +258,7 @@ class Archive:
         return [name.removesuffix(SUFFIX) for name in names]
 
     def _check_robot(self, robot: str) -> None:
-        if not any(map(self._files.record, self._imports_of(robot))):
+        if not set(self._imports_of(robot)).intersection(self._files.imports()):
             known = ", ".join(map(repr, self.robots())) or "none"
             raise InvalidInput(f"the archive {self.url!r} has no robot {robot!r}; its robots: {known}")
 

@@ -20,7 +20,6 @@ from zstate.archive.layout import (
     value_of,
 )
 from zstate.archive.storage import Store, arrow
-from zstate.errors import RecordingError
 
 Stamps = NDArray[np.int64]
 
@@ -147,11 +146,6 @@ class Files:
                 known = opened.schema_arrow.names
                 columns = [name for name in columns if name in known]
             return opened.read_row_groups(groups.numbers, columns=columns)
-
-    def missing(self, entry: Entry) -> RecordingError:
-        """The error for a file that its import lists, and that is not there."""
-        where = self.store.where(entry.path)
-        return RecordingError(f"{where!r} is missing; `zstate archive` adds its recording again", path=where)
 
 
 def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) -> list[int]:

@@ -47,7 +47,7 @@ from zstate.archive.layout import (
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.tracks import JointTrack, PoseTrack
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, RecordingError
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.plugins import stream_named
@@ -95,12 +95,18 @@ def import_recording(
 
     A recording that was added before adds nothing. An import that is interrupted leaves the archive as it
     was; another one of the same recording completes it. ``on_progress(text)`` is called now and then.
-    Raises RecordingError for a recording that cannot be read, and an archive that cannot be written, and
-    InvalidInput for a recording in simulated time, whose stamps have no date.
+    Raises RecordingError for a recording that cannot be read or is not complete, and an archive that cannot
+    be written, and InvalidInput for a recording in simulated time, whose stamps have no date.
     """
     store = Store(url)
     with RecordingReader(path) as reader:
         files = [storage.path for storage in reader.storages]
+        if not reader.complete:
+            text = f"{str(path)!r} is not complete: {'; '.join(reader.losses) or 'it has no end'}"
+            advice = (
+                "wait until it is recorded, or let `zstate recover` write a complete file of what is there"
+            )
+            raise RecordingError(f"{text}; {advice}", path=str(path))
         decoded = DecodedRecording(reader, Refusals().count)
         span = reader.span
     name = file_digest(files)

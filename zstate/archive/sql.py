@@ -90,7 +90,9 @@ def _add_view(connection: Any, store: Store, name: str, folder: str, columns: st
     quoted = '"' + name.replace('"', '""') + '"'
     if store.is_local:  # DuckDB reads the files itself
         pattern = f"{store.root}/{folder}/**/*.parquet".replace("'", "''")
-        source = f"read_parquet('{pattern}', hive_partitioning = true, union_by_name = true)"
+        is_alike = folder.partition("=")[0] != "stream"  # then one file shows the columns of all
+        options = f"hive_partitioning = true, union_by_name = {str(not is_alike).lower()}"
+        source = f"read_parquet('{pattern}', {options})"
     else:
         dataset = arrow().dataset.dataset(
             f"{store.root}/{folder}", filesystem=store.filesystem, partitioning="hive", format="parquet"

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 from zstate.archive.files import Entry, Files
@@ -49,22 +50,23 @@ def check(url: str) -> Iterator[Finding]:
     files = Files(store)
     listed: dict[str, Entry] = {}
     for name in files.imports():
-        try:
+        with suppress(RecordingError):  # it is found below
             listed |= {one.path: one for one in files.record(name)}
-        except RecordingError as error:
-            yield Finding(f"{folder_of(IMPORTS)}/{name}{SUFFIX}", f"{error}; add its recording again")
     present: set[str] = set()
     for path, _ in store.files():
         present.add(path)
-        problem = _problem(files, path, is_listed=path in listed)
-        if problem:
+        if problem := _problem(files, path, listed.get(path)):
             yield Finding(path, problem)
     for path in sorted(listed.keys() - present):
-        yield Finding(path, str(files.missing(listed[path])))
+        yield Finding(path, f"missing; {_repair(listed[path])}")
 
 
-def _problem(files: Files, path: str, *, is_listed: bool) -> str:
-    """What is wrong with a file; empty for nothing."""
+def _repair(entry: Entry) -> str:
+    return f"remove {folder_of(IMPORTS)}/{entry.name}{SUFFIX} and add {entry.recording!r} again"
+
+
+def _problem(files: Files, path: str, entry: Entry | None) -> str:
+    """What is wrong with a file, which an import lists as ``entry``; empty for nothing."""
     top, _, name = path.partition("/")
     if top.startswith(STAGING):
         return "left by an import that was interrupted: add its recording again, or remove the folder"
@@ -74,21 +76,22 @@ def _problem(files: Files, path: str, *, is_listed: bool) -> str:
                 files.table(path)
                 return ""
             if top.startswith("stream="):
-                return _problem_of_samples(files, path, name.rpartition("/")[2], is_listed=is_listed)
+                return _problem_of_samples(files, path, name.rpartition("/")[2], entry)
         except (RecordingError, OSError) as error:
-            return f"{error}"
+            return f"{error}; remove it, and add its recording again"
         except ValueError:  # also ArrowInvalid
             pass
     return "not a file of an archive of zstate; move it away"
 
 
-def _problem_of_samples(files: Files, path: str, name: str, *, is_listed: bool) -> str:
+def _problem_of_samples(files: Files, path: str, name: str, entry: Entry | None) -> str:
     _, digest, _ = name.split(".")
     content = files.store.read(path)
-    if not is_listed:
+    if entry is None:
         check_version(arrow().parquet.read_metadata(arrow().BufferReader(content)).metadata, path)
         return "of an import that was interrupted: add its recording again, or remove the file"
-    return "" if bytes_digest(content) == digest else "damaged: its bytes have another digest than its name"
+    is_whole = bytes_digest(content) == digest
+    return "" if is_whole else f"damaged: its bytes have another digest than its name; {_repair(entry)}"
 
 
 def expire(url: str, before: str) -> Removed:
