@@ -10,6 +10,7 @@ import pytest
 from helpers.recording_builder import (
     MS,
     START,
+    Bag,
     RecordingBuilder,
     S,
     pose,
@@ -18,7 +19,7 @@ from helpers.recording_builder import (
 )
 from recording.test_recording import wild
 
-from zstate import Archive, Recording, UnknownFrame
+from zstate import Archive, Recording, Transform, UnknownFrame
 from zstate.archive import import_recording
 from zstate.archive.cut import cut
 from zstate.errors import InvalidInput, RecordingError
@@ -130,6 +131,32 @@ def test_lookups_equal_those_of_the_recording_after_an_import_in_parts(tmp_path:
             assert_same_lookups(archive, recording, np.array([stamp, stamp + 1]))
         assert_same_joint_states(archive, recording, begin, end)
     assert [one.recording for one in archive.coverage("arm")] == ["0.mcap", "1.mcap", "2.mcap"]
+
+
+def test_lookups_equal_those_of_a_bag_whose_nodes_share_an_edge(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("zstate.archive.importer._MESSAGES", 100)
+    with Bag(tmp_path / "bag") as bag:
+        bag.describe()
+        bag.tf(START, [Transform.from_pose7("tool", "tip", pose(z=0.3))], topic="/tf_static")
+        for n in range(600):
+            stamp = START + n * 20 * MS
+            bag.joints(stamp, dict(zip(("shoulder", "elbow"), swing_positions(n / 50), strict=True)))
+            if n % 5 == 0:
+                placed = Transform.from_pose7("odom", "world", pose(y=n / 50), stamp)
+                bag.tf(stamp, [Transform.from_pose7("map", "odom", pose(n / 50, yaw=n / 99), stamp), placed])
+            if n % 7 == 0:
+                bag.tf(stamp, [Transform.from_pose7("odom", "world", pose(y=-n / 50), stamp + 3 * MS)])
+    import_recording(str(tmp_path / "a"), tmp_path / "bag")
+    archive = Archive(str(tmp_path / "a"))
+    stamps = np.random.default_rng(0).integers(START - S, START + 13 * S, 200)
+    with Recording(tmp_path / "bag", "ros") as recording:
+        buffer = recording.buffer()
+        for target, source in PAIRS:
+            poses, valid = buffer.lookup_many(target, source, stamps)
+            found, is_found = archive.lookup_many(target, source, stamps, robot="ros")
+            assert valid.any()
+            assert np.array_equal(is_found, valid)
+            assert np.array_equal(found, poses, equal_nan=True)
 
 
 def test_drivers_of_some_joints_each_are_interpolated_between_their_own_samples(tmp_path: Path):
