@@ -5,17 +5,27 @@ from typing import TYPE_CHECKING
 from zstate._util.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from zstate.archive.archive import Archive, Coverage
-    from zstate.archive.batches import poses
+    from zstate.archive.archive import Archive, ArchivedMessage, Coverage
+    from zstate.archive.batches import PoseColumns, poses
     from zstate.archive.importer import ImportReport, import_recording
 
-__all__ = ["Archive", "Coverage", "ImportReport", "import_recording", "poses"]
+__all__ = [
+    "Archive",
+    "ArchivedMessage",
+    "Coverage",
+    "ImportReport",
+    "PoseColumns",
+    "import_recording",
+    "poses",
+]
 
 _HOMES = {
     "Archive": "archive",
+    "ArchivedMessage": "archive",
     "Coverage": "archive",
     "ImportReport": "importer",
     "import_recording": "importer",
+    "PoseColumns": "batches",
     "poses": "batches",
 }
 

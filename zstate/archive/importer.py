@@ -81,7 +81,7 @@ class ImportReport:
 
     path: Path
     is_known: bool = False
-    robots: tuple[str, ...] = ()
+    robots: Sequence[str] = ()
     rows: Counter[str] = field(default_factory=Counter[str])
     files: int = 0
     size: int = 0
