@@ -48,6 +48,7 @@ _ALIASES = (
 )
 nitpicky = True
 nitpick_ignore_regex = [
+    ("py:class", r"DuckDBPyConnection"),
     ("py:.*", r"(collections|os|pathlib|threading)\..*"),
     ("py:class", "|".join(("msgspec.Meta", r"(.*\.)?(S|M|_\w+|\w+Like)", *_ALIASES))),
 ]
@@ -69,7 +70,7 @@ html_copy_source = False
 
 # The modules whose names are the API.
 PUBLIC = (
-    *("zstate", "zstate.cameras", "zstate.clouds", "zstate.driving", "zstate.errors"),
+    *("zstate", "zstate.archive", "zstate.cameras", "zstate.clouds", "zstate.driving", "zstate.errors"),
     *("zstate.odometry", "zstate.scans", "zstate.sources"),
 )
 

@@ -21,7 +21,7 @@ from zstate.plugins import built_in_plugins
 PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # The plugins that stand on others; below the rest is only the core.
-_ABOVE = {"recording", "bridges", "metrics", "foxglove", "view"}
+_ABOVE = {"archive", "recording", "bridges", "metrics", "foxglove", "view"}
 _PLUGINS = {plugin.name for plugin in built_in_plugins()}
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
@@ -40,6 +40,7 @@ FLOORS = (
     {"nodes"},
     _PLUGINS - _ABOVE,
     {"bridges", "recording"},
+    {"archive"},
     {"zstate"},
     {"metrics", "foxglove"},
     {"view", "cli"},
@@ -66,6 +67,7 @@ HOMES = {
     "xxhash": "wire",
     "mcap": "recording",
     "pyarrow": "recording",  # `zstate export`
+    "duckdb": "archive",
     "lz4": "recording",
     "zstandard": "recording",
     "rospy": "bridges",
@@ -100,6 +102,7 @@ GUESTS = {
     ("cli/up/cell.py", "msgspec"),
     ("cli/up/command_table.py", "msgspec"),
     ("driving/cli/drive.py", "msgspec"),  # so is --param, into the types that a driver annotates
+    ("archive/storage.py", "pyarrow"),
     ("clouds/compression.py", "lz4"),
     ("clouds/compression.py", "zstandard"),
     ("cameras/simulated_camera.py", "PIL"),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from zstate import errors as errors
+    from zstate.archive.archive import Archive
     from zstate.buffer.buffer import TransformBuffer
     from zstate.errors import (
         AccessDenied,
@@ -59,6 +60,7 @@ __version__ = "0.1.0"
 __all__ = [
     "AccessDenied",
     "AmbiguousFrame",
+    "Archive",
     "ClockMismatch",
     "ClockPublisher",
     "Closed",
@@ -101,6 +103,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Archive": "archive.archive",
     "ClockPublisher": "nodes.clock",
     "JointReading": "sources",
     "JointStateListener": "sources",

@@ -36,6 +36,7 @@ _BUILT_IN = (
     "cameras",
     "fleet",
     "recording",
+    "archive",
     "view",
     "foxglove",
     "bridges",

@@ -95,6 +95,10 @@ REQUIREMENTS = {
         lambda: Path(os.environ.get("ZSTATE_LEROBOT_PYTHON", "")).is_file(),
         "as .ci/nightly makes an environment of lerobot, 5 GB",
     ),
+    "cluster": Requirement(
+        lambda: Path(os.environ.get("ZSTATE_CLUSTER_PYTHON", "")).is_file(),
+        "as .ci/nightly makes an environment of Ray and moto",
+    ),
 } | {
     name: Requirement(
         lambda name=name: has_oracle(name),

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree, TreeSnapshot
-from zstate.buffer.history import FastPath, merged
+from zstate.buffer.history import FastPath, History, HistoryView, merged
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, checked_rows
 from zstate.buffer.tracks import ClockOffsets, JointTrack, PoseTrack, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
+from zstate.checks import Floats
 from zstate.clock import Clock, SystemClock
 from zstate.errors import InsertRefused, InvalidInput
 
@@ -216,6 +217,58 @@ class BufferFeed:
                 self._tree.invalidate(track)
         self._waiters.notify(*past)
         return count
+
+    def take_before(self, track: JointTrack | PoseTrack, stamp: int) -> HistoryView:
+        """Remove the samples of ``track`` before ``stamp`` [ns] but the last; returns all of these.
+
+        What is left begins with that last one: a history that begins with another sample was restarted.
+        """
+        with self._lock:
+            view = track.history.view
+            end = view.first + int(view.kept_stamps().searchsorted(stamp))
+            taken = view._replace(end=end)
+            if taken.size > 1:
+                rest = view._replace(first=end - 1)
+                track.history.replace(rest.kept_stamps(), rest.kept_rows())
+        return taken
+
+    def load_joints(
+        self, track: JointTrack, stamps: NDArray[np.int64], positions: Floats, velocities: Floats | None
+    ) -> None:
+        """Set all samples of ``track``, which a buffer held before: no number is checked or changed.
+
+        ``stamps`` (T,) [ns] ascend; ``positions`` are (T, nq) and ``velocities`` (T, nv), NaN if not known.
+        """
+        with self._lock:
+            self._owner.check(track)
+            rows = positions
+            if velocities is not None and not track.has_velocities:
+                track.history = History(track.history.width + velocities.shape[1], self._span_ns)
+            if track.has_velocities:
+                if velocities is None:
+                    velocities = np.full((len(stamps), track.model.velocity_count), np.nan)
+                rows = np.hstack((positions, velocities))
+            track.history.replace(stamps, rows)
+            self._tree.invalidate(track)
+        self._waiters.notify(track)
+
+    def load_poses(
+        self, edge: EdgeNames, stamps: NDArray[np.int64], poses: Poses, covariances: Floats | None
+    ) -> None:
+        """Set all samples of a moving edge, which a buffer held before: no number is checked or changed.
+
+        ``stamps`` (T,) [ns] ascend, at least one; ``poses`` are (T, 7) and ``covariances`` (T, 21), NaN if
+        not known. Raises InsertRefused as ``insert_many``.
+        """
+        with self._lock:
+            ((track, _),) = self._pose_tracks.track_rows((edge,), int(stamps[-1]), None)
+            rows = poses
+            if covariances is not None:
+                track.history = History(7 + covariances.shape[1], self._span_ns)
+                rows = np.hstack((poses, covariances))
+            track.history.replace(stamps, rows)
+            self._tree.invalidate(track)
+        self._waiters.notify(track)
 
     def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
         """A fast path into this buffer for the messages of one writer, see ``FastPath``."""

@@ -38,7 +38,7 @@ from zstate.recording.recording import Recording
 from zstate.streams import StreamName
 from zstate.wire.json_form import json_text
 from zstate.wire.keys import full_name
-from zstate.wire.messages import StampedMessage
+from zstate.wire.messages import Message, StampedMessage
 
 _ROWS = 4096
 """Rows written together."""
@@ -218,6 +218,18 @@ def _columns(batch: Sequence[DecodedMessage], hints: Mapping[str, Any]) -> dict[
         column = name if name not in columns else f"message.{name}"
         columns[column] = _column(name, [getattr(message, name) for message in messages], hints[name])
     return columns
+
+
+def plain_columns(messages: Sequence[Message]) -> dict[str, NDArray[Any]]:
+    """The fields of ``messages`` of one class that are numbers or texts, but stamp and number, as columns."""
+    hints = get_type_hints(type(messages[0]))
+    head = StampedMessage.__struct_fields__
+    plain = [name for name in messages[0].__struct_fields__ if name not in head and _is_plain(hints[name])]
+    return {name: _column(name, [getattr(one, name) for one in messages], hints[name]) for name in plain}
+
+
+def _is_plain(hint: Any) -> bool:
+    return hint in _NUMBERS or hint in (str, str | None)
 
 
 def _column(name: str, values: Sequence[Any], hint: Any) -> NDArray[Any]:

@@ -1,0 +1,3 @@
+from helpers.command_fixtures import impatient, state_folder
+
+__all__ = ["impatient", "state_folder"]

@@ -1,0 +1,78 @@
+"""zstate archive: recordings are added, listed, checked and removed."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+from archive.test_archive import MIDNIGHT, tour
+from helpers.cli_runner import failure, run_cli
+from helpers.recording_builder import RecordingBuilder, S, swing_positions
+
+
+def test_recordings_are_added_once_and_listed_by_robot(tmp_path: Path):
+    url = str(tmp_path / "a")
+    assert "has no recording" in failure("archive", url)
+    for number in range(2):
+        start = MIDNIGHT + number * 2 * S
+        tour(tmp_path / f"{number}.mcap", start, start + S)
+    files = [str(path) for path in sorted(tmp_path.glob("*.mcap"))]
+    added = run_cli("archive", url, "--from", *files)
+    assert added.code == 0
+    assert added.stdout.count("50 joint_states") == 2
+    assert "nothing missing" in added.stdout
+    assert (
+        run_cli("archive", url, "--from", files[0]).stdout.replace("\n", " ").count("in the archive already")
+        == 1
+    )
+    heading, row = run_cli("archive", url).stdout.splitlines()
+    assert heading.split() == ["ROBOT", "RECORDINGS", "FROM", "TO", "SAMPLES"]
+    assert re.fullmatch(r"arm +2 +2023-11-15 00:00:00 +2023-11-15 00:00:02 +\d+", row)
+
+
+def test_a_minute_of_the_archive_is_a_recording_for_all_other_commands(tmp_path: Path):
+    tour(tmp_path / "r.mcap", MIDNIGHT + 30 * S, MIDNIGHT + 31 * S)
+    url, minute = str(tmp_path / "a"), str(tmp_path / "minute.mcap")
+    assert run_cli("archive", url, "--from", str(tmp_path / "r.mcap")).code == 0
+    written = run_cli("archive", url, "cut", minute, "arm", "--at", "2023-11-15T00:00").stdout
+    assert "50 joint_states" in written.replace("\n", " ")
+    assert "arm" in run_cli("info", minute).stdout
+    assert "exists" in failure("archive", url, "cut", minute, "arm", "--at", "2023-11-15T00:00")
+    half = str(tmp_path / "half.mcap")
+    stamps = ("--from", "2023-11-15T00:00:30", "--to", str(MIDNIGHT + 30 * S + S // 2))
+    assert "26 joint_states" in run_cli("archive", url, "cut", half, "arm", *stamps).stdout.replace("\n", " ")
+    assert "--from TIME --to TIME" in failure("archive", url, "cut", half, "arm", code=2)
+    assert "no time like" in failure("archive", url, "cut", half, "arm", "--at", "noon", code=2)
+
+
+def test_a_recording_that_cannot_be_added_is_named_and_the_others_are_in(tmp_path: Path):
+    tour(tmp_path / "good.mcap", MIDNIGHT, MIDNIGHT + S)
+    (tmp_path / "bad.mcap").write_bytes(b"nothing")
+    url, bad = str(tmp_path / "a"), str(tmp_path / "bad.mcap")
+    said = failure("archive", url, "--from", bad, str(tmp_path / "good.mcap"))
+    assert "1 recording not added" in said
+    assert run_cli("archive", url).stdout.splitlines()[1].startswith("arm")
+    assert "at least one RECORDING" in failure("archive", url, "--from", code=2)
+
+
+def test_upkeep_names_damaged_files_and_removes_days_and_robots(tmp_path: Path):
+    url = str(tmp_path / "a")
+    today = int(datetime.now(UTC).timestamp()) * S
+    for name, start in (("old", MIDNIGHT), ("new", today - 86_400 * S)):
+        with RecordingBuilder(tmp_path / f"{name}.mcap", "arm") as builder:
+            builder.describe("arm", at=start)
+            for n in range(3):
+                builder.joints("arm", start + n, swing_positions(n))
+        assert run_cli("archive", url, "--from", str(tmp_path / f"{name}.mcap")).code == 0
+    assert "as they were written" in run_cli("archive", url, "check").stdout
+    assert "before 20" in run_cli("archive", url, "expire", "--before", "90d").stdout
+    assert run_cli("archive", url).stdout.splitlines()[1].split()[:2] == ["arm", "1"]
+    assert "no date like" in failure("archive", url, "expire", "--before", "soon", code=2)
+    (file,) = (tmp_path / "a").rglob("stream=joint_states/**/*.parquet")
+    file.write_bytes(file.read_bytes()[:-1])
+    said = run_cli("archive", url, "check")
+    assert said.code == 1
+    assert "another digest" in said.stdout.replace("\n", " ")
+    assert "of arm" in run_cli("archive", url, "forget", "arm").stdout
+    assert "no robot 'arm'" in failure("archive", url, "forget", "arm")

@@ -1,0 +1,76 @@
+"""An archive on an object store, and on a cluster: the same answers as in one process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from archive.test_archive import MIDNIGHT, assert_same_lookups, tour
+from archive.test_batches import matrix
+from helpers.processes import DEADLINE_S
+from helpers.recording_builder import MS, S
+
+from zstate import Archive, Recording
+from zstate.archive import import_recording
+from zstate.archive.upkeep import check, expire, forget
+
+HELPERS = Path(__file__).parents[1] / "helpers"
+pytestmark = [pytest.mark.cluster, pytest.mark.soak]
+
+
+def python() -> str:
+    return os.environ["ZSTATE_CLUSTER_PYTHON"]
+
+
+@pytest.fixture
+def bucket(monkeypatch) -> Iterator[str]:
+    """The URL of an archive in a bucket that nothing else has."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([python(), str(HELPERS / "object_store.py")], text=True, **pipes) as server:
+        address = next(line.strip() for line in server.stdout if line.startswith("127"))
+        yield f"s3://fleet/year?endpoint_override={quote(f'http://{address}', safe='')}"
+        server.stdin.close()
+        server.wait(DEADLINE_S)
+
+
+def test_an_archive_on_an_object_store_answers_as_the_recording(tmp_path: Path, bucket: str):
+    tour(tmp_path / "r.mcap", MIDNIGHT - S, MIDNIGHT + S)
+    assert Archive(bucket).robots() == ()
+    assert not import_recording(bucket, tmp_path / "r.mcap").is_known
+    assert import_recording(bucket, tmp_path / "r.mcap").is_known
+    archive = Archive(bucket)
+    with Recording(tmp_path / "r.mcap", "arm") as recording:
+        assert_same_lookups(archive, recording, np.arange(MIDNIGHT - S, MIDNIGHT + S, 9 * MS))
+    assert list(check(bucket)) == []
+    with archive.duckdb() as connection:
+        assert connection.sql("SELECT count(*) FROM joint_states").fetchall() == [(100,)]
+    expire(bucket, "2023-11-15")
+    assert len(Archive(bucket).joint_states("arm", 0, 2**62)) == 50
+    forget(bucket, "arm")
+    assert Archive(bucket).robots() == ()
+
+
+@pytest.mark.timeout(600)
+def test_ray_gives_the_poses_of_one_process_though_a_worker_is_killed(tmp_path: Path):
+    tour(tmp_path / "r.mcap", MIDNIGHT - 5 * S, MIDNIGHT + 5 * S)
+    url, output = str(tmp_path / "a"), str(tmp_path / "poses.parquet")
+    import_recording(url, tmp_path / "r.mcap")
+    command = [python(), str(HELPERS / "ray_poses.py"), url, "world", "tip", output]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "2 nodes, one worker killed" in ended.stdout
+    table = pq.read_table(output)
+    stamps = table.column("stamp").to_numpy()
+    assert stamps.tolist() == list(range(MIDNIGHT - 5 * S, MIDNIGHT + 5 * S, 20 * MS))
+    expected, valid = Archive(url).lookup_many("world", "tip", stamps, robot="arm")
+    assert valid.sum() > 400
+    assert np.array_equal(matrix(table), expected, equal_nan=True)

@@ -1,0 +1,172 @@
+"""The files of an archive that reads need: listed by import, chosen by time, read by row group."""
+
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyarrow has no annotations
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.archive.layout import (
+    IMPORTS,
+    SUFFIX,
+    check_version,
+    date_of,
+    folder_of,
+    value_of,
+)
+from zstate.archive.storage import Store, arrow
+
+Stamps = NDArray[np.int64]
+
+
+class Entry(NamedTuple):
+    """A file of samples, as the import ``name`` of a recording lists it.
+
+    ``frames`` is the digest of the static edges and the model that were in effect, ``recorded`` the first log
+    time [ns] of the recording.
+    """
+
+    name: str
+    path: str
+    stream: str
+    robot: str
+    date: str
+    key: str
+    rows: int
+    first: int
+    last: int
+    frames: str
+    recorded: int
+    recording: str
+
+
+class Groups(NamedTuple):
+    """Row groups of one file to read."""
+
+    entry: Entry
+    numbers: list[int]
+    rows: int
+
+
+class Files:
+    """The files of the archive in ``store``. What was read of one is kept: files do not change."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._records: dict[str, tuple[Entry, ...]] = {}
+        self._footers: dict[str, Any] = {}
+
+    def imports(self) -> list[str]:
+        """The names of all complete imports."""
+        return [name.removesuffix(SUFFIX) for name in self.store.names(folder_of(IMPORTS))]
+
+    def record(self, name: str) -> tuple[Entry, ...]:
+        """The files of the import ``name``; none if it is not complete."""
+        if name not in self._records:
+            path = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
+            if not self.store.has(path):
+                return ()
+            rows = self.table(path).to_pylist()
+            known = Entry._fields[1:]
+            self._records[name] = tuple(Entry(name, *(row[field] for field in known)) for row in rows)
+        return self._records[name]
+
+    def table(self, path: str) -> Any:
+        """A table that fits into memory, a pyarrow.Table."""
+        with self.store.opened(path) as file:
+            opened = arrow().parquet.ParquetFile(file, page_checksum_verification=True)
+            check_version(opened.metadata.metadata, self.store.where(path))
+            return opened.read()
+
+    def dates(self, stream: str, robot: str) -> list[str]:
+        """The dates with samples of a robot."""
+        return [value_of(name) for name in self.store.folders(folder_of(stream, robot))]
+
+    def around(self, robot: str, streams: Iterable[str], stamps: Stamps) -> list[Entry]:
+        """All files of the imports with files on the dates of ascending ``stamps``, or next to these."""
+        days = np.unique(stamps // (86_400 * 10**9)).tolist()
+        wanted = np.array([date_of(int(day) * 86_400 * 10**9) for day in days])
+        names: set[str] = set()
+        for stream in streams:
+            dates = np.array(self.dates(stream, robot), str)
+            at, after = dates.searchsorted(wanted), dates.searchsorted(wanted, "right")
+            chosen = {*at.tolist(), *(at - 1).tolist(), *after.tolist()}
+            for number in sorted(one for one in chosen if 0 <= one < len(dates)):
+                files = self.store.names(folder_of(stream, robot, str(dates[number])))
+                names |= {file.partition(".")[0] for file in files if file.endswith(SUFFIX)}
+        return [one for name in sorted(names) for one in self.record(name) if one.robot == robot]
+
+    def groups(self, entries: Sequence[Entry], stamps: Stamps, *, between: bool) -> list[Groups]:
+        """The row groups of files of one key with the samples around each of ascending ``stamps``.
+
+        With ``between`` also all samples from the first to the last of the stamps.
+        """
+        chosen = _needed([(one.first, one.last) for one in entries], stamps, between=between)
+        entries = [entries[number] for number in chosen]
+        spans: list[tuple[int, int]] = []
+        places: list[tuple[int, int]] = []
+        for number, entry in enumerate(entries):
+            footer = self.footer(entry)
+            column = footer.schema.names.index("stamp")
+            for group in range(footer.num_row_groups):
+                statistics = footer.row_group(group).column(column).statistics
+                spans.append((statistics.min, statistics.max))
+                places.append((number, group))
+        by_file: dict[int, list[int]] = {}
+        for one in _needed(spans, stamps, between=between):
+            number, group = places[one]
+            by_file.setdefault(number, []).append(group)
+        found: list[Groups] = []
+        for number, numbers in by_file.items():
+            footer = self.footer(entries[number])
+            rows = sum(footer.row_group(group).num_rows for group in numbers)
+            found.append(Groups(entries[number], numbers, rows))
+        return found
+
+    def footer(self, entry: Entry) -> Any:
+        """The metadata of a file. Raises RecordingError for one that cannot be read."""
+        if entry.path not in self._footers:
+            with self.store.opened(entry.path) as file:
+                footer = arrow().parquet.read_metadata(file)
+            check_version(footer.metadata, self.store.where(entry.path))
+            self._footers[entry.path] = footer
+        return self._footers[entry.path]
+
+    def read(self, groups: Groups, columns: Sequence[str] | None = None) -> Any:
+        """The rows of ``groups``, a pyarrow.Table; of ``columns`` those that the file has."""
+        footer = self.footer(groups.entry)
+        with self.store.opened(groups.entry.path) as file:
+            opened = arrow().parquet.ParquetFile(file, metadata=footer, page_checksum_verification=True)
+            if columns is not None:
+                known = opened.schema_arrow.names
+                columns = [name for name in columns if name in known]
+            return opened.read_row_groups(groups.numbers, columns=columns)
+
+
+def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) -> list[int]:
+    """Which ``spans`` (first stamp, last stamp) may have the samples around each of ``stamps``, in order."""
+    if not spans or not len(stamps):
+        return []
+    firsts, lasts = np.array(spans, np.int64).T
+    if between:
+        is_needed = (firsts <= stamps[-1]) & (lasts >= stamps[0])
+        stamps = stamps[[0, -1]]
+    else:
+        is_needed = stamps.searchsorted(firsts) < stamps.searchsorted(lasts, "right")
+    by_first, by_last = np.argsort(firsts, kind="stable"), np.argsort(lasts, kind="stable")
+    overlap = (firsts[by_first][1:] <= np.maximum.accumulate(lasts[by_first])[:-1]).any()
+    alone = stamps
+    if not overlap:
+        place = firsts[by_first].searchsorted(stamps, "right") - 1
+        inside = (place >= 0) & (stamps <= lasts[by_first][place])
+        alone = stamps[~inside]
+    before = lasts[by_last].searchsorted(alone, "right") - 1
+    after = firsts[by_first].searchsorted(alone)
+    is_needed[by_last[before[before >= 0]]] = True
+    is_needed[by_first[after[after < len(firsts)]]] = True
+    return np.flatnonzero(is_needed).tolist()

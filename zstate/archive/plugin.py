@@ -1,0 +1,13 @@
+"""What archives bring: a command. Their messages are those of recordings."""
+
+from zstate.plugins import Command, Plugin
+
+PLUGIN = Plugin(
+    "archive",
+    commands={
+        "archive": Command(
+            "zstate.archive.cli.archive:archive_command", "Record", "Recordings of months as Parquet."
+        ),
+    },
+    needs=("recording",),
+)
