@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import tempfile
 import threading
 import time
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from helpers.cli_runner import run_cli
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
@@ -20,6 +23,7 @@ from zstate.fleet.router_config import RouterConfig, Uplink
 from zstate.net.session import Session
 from zstate.net.sites import SiteAnnouncement, Thinning, discover_sites
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import ImuPublisher
 
 RATE_HZ = 50.0
 THIN_HZ = 5.0
@@ -149,7 +153,65 @@ def test_a_site_is_announced_with_its_robots_and_rates():
             sites = discover_sites(session)
             assert sites.robots == {"plant1": frozenset(many)}
             assert sites.thinning("robot_0999", "joint_states") == Thinning("plant1", 5.0)
-            assert str(sites.thinning("robot_0000", "tf")) == "not passed on purpose by site 'plant1'"
+            assert str(sites.thinning("robot_0000", "tf")) == "held back on purpose by site 'plant1'"
             assert sites.thinning("robot_0000", "robot_description") is None
             assert sites.thinning("other", "joint_states") is None
         assert discover_sites(session).robots == {}
+
+
+def test_tools_at_headquarters_call_no_sample_lost_that_the_site_holds_back():
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        published(site.local, ("r1",)),
+        ImuPublisher(site.local, "r1", "torso", frame="lower") as imu,
+    ):
+        imu.publish((0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+        far, near = ("--connect", site.headquarters), ("--connect", site.site_endpoint)
+        assert "thinned to 5 Hz on purpose by site 'plant1'" in run_cli("hz", "r1", "--once", *far).stdout
+        there = run_cli("hz", "r1", "--once", *near).stdout
+        assert "missed" not in there
+        assert "plant1" not in there
+        (listed,) = json.loads(run_cli("ls", "--json", *far).stdout)
+        assert listed["site"] == "plant1"
+        thinned = {one["stream"]: one["thinned_hz"] for one in listed["writers"]}
+        assert thinned == {
+            **dict.fromkeys(("tf", "imu"), 0.0),
+            **dict.fromkeys(("tf_static", "robot_description")),
+            "joint_states": 5.0,
+        }
+        text = run_cli("ls", *far).stdout
+        assert "'plant1', from which joint_states at 5 Hz leave" in text
+        assert re.search(r"imu/torso +held back", text)
+        graph = json.loads(run_cli("graph", "--json", *far).stdout)["streams"]
+        rates = {one["stream"]: one["thinned_hz"] for one in graph if one["writers"]}
+        assert (rates["joint_states"], rates["imu/torso"]) == (5.0, 0.0)
+
+
+@pytest.mark.long
+def test_doctor_at_headquarters_names_the_site_and_finds_nothing_wrong():
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        published(site.local, ("r1",)),
+        ImuPublisher(site.local, "r1", "torso", frame="lower") as imu,
+    ):
+        imu.publish((0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+        ended = run_cli("doctor", "r1", "--json", "--connect", site.headquarters)
+        checks = {one["name"]: one for one in json.loads(ended.stdout)["checks"]}
+        assert ended.code == 0, ended
+        assert checks["site"]["text"] == "'plant1', from which joint_states at 5 Hz leave"
+        assert "thinned to 5 Hz on purpose by site 'plant1'" in checks["joint_states"]["text"]
+        assert "held back on purpose by site 'plant1'" in checks["imu"]["text"]
+
+
+def test_tf_exact_asks_the_robot_itself():
+    with running_site(("r1",), {"joint_states": THIN_HZ}) as site, published(site.local, ("r1",)):
+        with TransformListener(site.local, "r1") as near:
+            until(lambda: near.stats.received > 50)
+            at = near.buffer.latest("base", "lower") - 133_000_000
+            there = near.buffer.lookup("base", "lower", at).to_dict()
+        far = ("--at", str(at), "--json", "--connect", site.headquarters)
+        found = json.loads(run_cli("tf", "base", "lower", "--exact", *far).stdout)
+        assert {name: found[name] for name in there} == there
+    ended = run_cli("tf", "base", "lower", "--exact")
+    assert ended.code == 2
+    assert "--exact asks for one pose" in ended.stderr

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from zstate._util.closeable import Closeable
@@ -30,12 +29,11 @@ class Thinning(NamedTuple):
     rate_hz: float
 
     def __str__(self) -> str:
-        how = f"thinned to {self.rate_hz:g} Hz" if self.rate_hz else "not passed"
+        how = f"thinned to {self.rate_hz:g} Hz" if self.rate_hz else "held back"
         return f"{how} on purpose by site {self.site!r}"
 
 
-@dataclass(frozen=True)
-class Sites:
+class Sites(NamedTuple):
     """The announced sites: the rates of streams [Hz] and the robots of each, by its name."""
 
     rates_hz: Mapping[str, Mapping[StreamName, float]]
@@ -45,12 +43,23 @@ class Sites:
         """The site that ``robot`` is behind; None if no site announces it."""
         return next((site for site, robots in self.robots.items() if robot in robots), None)
 
+    def text_of(self, robot: str) -> str:
+        """The site of ``robot``, and what leaves it; empty if no site announces the robot."""
+        site = self.site_of(robot)
+        if site is None:
+            return ""
+        leaving = [f"{stream} at {rate_hz:g} Hz" for stream, rate_hz in self.rates_hz[site].items()]
+        return f"{site!r}, from which {' and '.join(leaving) or 'no sample'} leave"
+
     def thinning(self, robot: str, stream: StreamName) -> Thinning | None:
         """How ``stream`` of ``robot`` is thinned; None without a site, or without samples."""
         site, row = self.site_of(robot), find_stream(stream)
         if site is None or row is None or not row.is_sampled:
             return None
         return Thinning(site, self.rates_hz[site].get(stream, 0.0))
+
+
+NO_SITES = Sites({}, {})
 
 
 class SiteAnnouncement(Closeable):
