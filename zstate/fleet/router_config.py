@@ -311,6 +311,7 @@ def access_text(roles: AclRoles) -> str:
         "commanders": roles.commanders,
         "timekeepers": roles.timekeepers,
         "placers": roles.placers,
+        "sites": [f"{site} ({', '.join(robots)})" for site, robots in roles.sites.items()],
     }
     if roles.wires != ("native",):
         names["wires"] = roles.wires
