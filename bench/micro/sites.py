@@ -51,6 +51,7 @@ def measure(
                 one.wait_for_event("open", JOIN_WITHIN_S)
             reader = opened.enter_context(running_role(follow, robots=count, endpoint=desk, seconds=seconds))
             reader.wait_for_event("joined", JOIN_WITHIN_S)
+            time.sleep(seconds)  # until models and clock offsets are through
             routers = (router, hq)
             cpu, sent, begin = [*map(cpu_ns, routers)], loopback_bytes(), time.monotonic()
             time.sleep(seconds)
@@ -84,6 +85,7 @@ def follow(robots: int, endpoint: str, seconds: float) -> list[tuple[str, str, f
                 time.sleep(0.02)
             joining_s = time.monotonic() - begin
             send_event("joined")
+            time.sleep(seconds)
             counted, cpu_s, begin = listener.stats, time.process_time(), time.monotonic()
             time.sleep(seconds)
             lasted, cpu_s, stats = time.monotonic() - begin, time.process_time() - cpu_s, listener.stats

@@ -112,10 +112,14 @@ def test_of_other_streams_no_sample_passes_while_values_and_queries_do():
 
 
 def test_a_lookup_at_headquarters_is_exact_on_demand():
-    """The joints move so that a straight line between samples of 5 Hz is far from them."""
+    """The joints move so that a straight line between samples of 5 Hz is far from them.
+
+    One process publishes several robots.
+    """
+    robots = ("r1", "r2", "r3")
     with (
-        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
-        published(site.local, ("r1",)),
+        running_site(robots, {"joint_states": THIN_HZ}) as site,
+        published(site.local, robots),
         TransformListener(site.local, "r1") as near,
         TransformListener(site.far, "r1", history_on_join=False) as far,
     ):
@@ -142,7 +146,7 @@ def test_a_writer_without_a_cache_is_named_by_an_exact_lookup():
         TransformListener(site.far, "r1") as far,
     ):
         until(lambda: (publisher.publish([0.1, 0.2]), far.buffer.can_lookup("base", "lower"))[1])
-        with pytest.raises(Unreachable, match=r"which places 'r1/lower', has not sent its samples"):
+        with pytest.raises(Unreachable, match=r"which places 'r1/upper', has not sent its samples"):
             far.lookup("base", "lower", exact=True, timeout_s=0.3)
 
 

@@ -56,7 +56,7 @@ def robots(endpoint: str, names: str, shift_s: str) -> None:
     clock.shift_ns = round(float(shift_s) * 1e9)
     with connect(mode="client", endpoints=endpoint) as session, ExitStack() as opened:
         publishers = [
-            opened.enter_context(StatePublisher(session, RRBOT, name, clock=clock))
+            opened.enter_context(StatePublisher(session, RRBOT, name, clock=clock, cache_s=10.0))
             for name in names.split(",")
         ]
         reading = opened.enter_context(connect(mode="client", endpoints=endpoint))

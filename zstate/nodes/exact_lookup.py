@@ -10,10 +10,14 @@ import threading
 import time
 
 from zstate.buffer.buffer import TransformBuffer, check_duration, feed_of
+from zstate.buffer.frame_tree import Edge
 from zstate.clock import check_stamp, wait_interruptible
 from zstate.errors import InFuture, InPast, LookupFailed, Unreachable, as_timeout
 from zstate.nodes.state_reader import StateReader
+from zstate.streams import JOINT_STREAMS
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import frame_owner
 
 _ROUND_S = 0.05
 """Between two requests for an instant that the writers have not reached yet."""
@@ -50,23 +54,36 @@ class ExactLookup:
         self, target: str, source: str, stamp: int, timeout_s: float
     ) -> LookupFailed | Unreachable | None:
         """Why the pose at ``stamp`` is not known exactly, after the writers were asked; None if it is."""
-        edges = feed_of(self._buffer).edges_between(target, source)
-        writers = {str(edge.writer): edge.names for edge in edges if edge.track is not None}
-        spans = self._reader.recall(writers, stamp, timeout_s)
-        for writer, edge in writers.items():
-            if writer not in spans:
-                return Unreachable(
-                    f"{writer}, which places {edge[1]!r}, has not sent its samples in {timeout_s:g} s: it "
-                    "keeps none (cache_s=0), or the link to it is slow; without exact the samples that "
-                    "have arrived answer",
-                    endpoints=(),
-                )
-            oldest, newest = spans[writer]
-            if not oldest <= stamp <= newest:
+        edges = [one for one in feed_of(self._buffer).edges_between(target, source) if one.track is not None]
+        writers = {edge.names: self._writers_of(edge) for edge in edges}
+        spans = self._reader.recall({one for found in writers.values() for one in found}, stamp, timeout_s)
+        for edge in edges:
+            found = [spans.get(one) for one in writers[edge.names]] or [None]
+            for span in found:
+                if span is None:
+                    return Unreachable(
+                        f"{edge.writer}, which places {edge.child!r}, has not sent its samples in time: it "
+                        "keeps none (cache_s=0), or the link to it is slow; without exact the samples that "
+                        "have arrived answer",
+                        endpoints=(),
+                    )
+                oldest, newest = span
+                if oldest <= stamp <= newest:
+                    continue
                 kind = InFuture if stamp > newest else InPast
-                reason = kind(
-                    target, source, edge=edge, requested=stamp, oldest=oldest, newest=newest, writer=writer
-                )
+                facts = {"requested": stamp, "oldest": oldest, "newest": newest}
+                reason = kind(target, source, edge=edge.names, writer=edge.writer, **facts)
                 reason.note = _IS_ALL if kind is InPast else ""
                 return reason
         return None
+
+    def _writers_of(self, edge: Edge) -> list[Announcement]:
+        """The announced writers that may have placed ``edge``; one process writes for many robots."""
+        robots = {frame_owner(name) for name in edge.names}
+        return [
+            one
+            for one in self._reader.announced
+            if one.robot in robots
+            and str(one.writer) == edge.writer
+            and (one.stream in JOINT_STREAMS) == (edge.kind == "joint")
+        ]

@@ -185,23 +185,29 @@ class StateReader(Closeable):
             for notify in self._observers:  # not by _observed(), whose call costs 0.2 us
                 notify()
 
-    def recall(self, writers: Collection[str], stamp: int, timeout_s: float) -> dict[str, tuple[int, int]]:
+    @property
+    def announced(self) -> frozenset[Announcement]:
+        """The writers of samples that may have a cache."""
+        return frozenset(self._announced.copy())
+
+    def recall(
+        self, writers: Collection[Announcement], stamp: int, timeout_s: float
+    ) -> dict[Announcement, tuple[int, int]]:
         """Request the samples that ``writers`` cached, back to ``stamp`` [ns], and insert them.
 
         Returns the oldest and the newest of their stamps, between which nothing is missing, of each writer
-        that replied within ``timeout_s`` [s]. Writers are given by their printed names.
+        that replied within ``timeout_s`` [s].
         """
-        requested = [one for one in self._announced.copy() if str(one.writer) in writers]
-        spans: dict[str, tuple[int, int]] = {}
-        waiting, done = len(requested), threading.Event()
+        spans: dict[Announcement, tuple[int, int]] = {}
+        waiting, done = len(writers), threading.Event()
 
-        def on_page(name: str, arrivals: list[SerializedSample], writer: int) -> bool:
+        def on_page(one: Announcement, arrivals: list[SerializedSample], writer: int) -> bool:
             samples = self._read_history(arrivals, writer)
             if not samples:
                 return False
             self._ingest_of(arrivals[0].key, writer).insert_history(samples, are_missing=True)
             oldest, newest = samples[0].stamp, samples[-1].stamp
-            spans[name] = oldest, max(newest, spans.get(name, (0, newest))[1])
+            spans[one] = oldest, max(newest, spans.get(one, (0, newest))[1])
             return oldest > stamp
 
         def on_done() -> None:
@@ -210,12 +216,12 @@ class StateReader(Closeable):
             if waiting <= 0:
                 done.set()
 
-        for one in requested:
+        for one in writers:
             key = stream_key(one.robot, one.stream, one.name)
-            on_page_of = self._observed(partial(on_page, str(one.writer)))
+            on_page_of = self._observed(partial(on_page, one))
             session = one.writer.session
             self._requests.add(HistoryRequest(key, session, on_page_of, self._count_undecodable, on_done))
-        if requested:
+        if writers:
             wait_interruptible(done, timeout_s)
         return spans.copy()
 
