@@ -23,6 +23,8 @@ pytestmark = [pytest.mark.processes, pytest.mark.netns]
 
 SITES = ("plant1", "plant2", "plant3")
 THIN_HZ = 5.0
+RETURN_OF_A_ROBOT_S = 0.04
+"""Its tokens, queryables and values cross the link of 2 Mbit/s again, before or between samples."""
 LOCAL = "tcp/127.0.0.1:7447"
 SHIFT_S = 2.0
 Spawn = Callable[..., Child]
@@ -124,7 +126,7 @@ def test_headquarters_of_three_sites_through_cuts_and_a_killed_router(
     print(f"cut of {cut_s:g} s: stale after {stale_s:.2f} s, complete {back_s:.2f} s after the return")
     assert sites["plant1"].query("received")[1] == before[1], "samples were lost within the site"
     assert stale_s < RECOVERED_WITHIN_S
-    assert back_s < RECOVERED_WITHIN_S
+    assert back_s < RECOVERED_WITHIN_S + RETURN_OF_A_ROBOT_S * count
 
     # The router of a site is killed: nothing of it arrives until it runs again.
     sites["plant2"].router.kill()
@@ -133,4 +135,4 @@ def test_headquarters_of_three_sites_through_cuts_and_a_killed_router(
     sites["plant2"].start_router()
     restarted_s = hq.query("when", everyone, 30.0)
     print(f"router killed: complete {restarted_s:.2f} s after its start")
-    assert restarted_s < 2 * RECOVERED_WITHIN_S
+    assert restarted_s < RECOVERED_WITHIN_S + RETURN_OF_A_ROBOT_S * count
