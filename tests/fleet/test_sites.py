@@ -175,6 +175,9 @@ def test_tools_at_headquarters_call_no_sample_lost_that_the_site_holds_back():
         there = run_cli("hz", "r1", "--once", *near).stdout
         assert "missed" not in there
         assert "plant1" not in there
+        monitored = run_cli("monitor", "--robots", "--robot", "r1", "--seconds", "1.5", *far).stdout
+        assert re.search(r"held back on purpose [1-9]", monitored)
+        assert "missed" not in monitored
         (listed,) = json.loads(run_cli("ls", "--json", *far).stdout)
         assert listed["site"] == "plant1"
         thinned = {one["stream"]: one["thinned_hz"] for one in listed["writers"]}

@@ -22,11 +22,19 @@ _TOKEN_LENGTH = 4000
 """The length of the names in one token. Keys may be longer, but each router keeps them."""
 
 
+_MOST = 1.25
+"""The largest ratio of a measured to the thinned rate."""
+
+
 class Thinning(NamedTuple):
     """What the router of ``site`` lets pass of one stream of one robot: ``rate_hz``; nothing if it is 0."""
 
     site: str
     rate_hz: float
+
+    def explains(self, rate_hz: float | None) -> bool:
+        """Whether the site makes the gaps in samples that arrive at ``rate_hz``: within it more arrive."""
+        return rate_hz is not None and rate_hz <= _MOST * self.rate_hz
 
     def __str__(self) -> str:
         how = f"thinned to {self.rate_hz:g} Hz" if self.rate_hz else "held back"

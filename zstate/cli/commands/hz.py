@@ -92,13 +92,14 @@ def hz_command(
         while time.monotonic() < end:
             count, facts = _read_for(1.0, reader, statistics), statistics.facts()
             if facts is not None and (count or once):
+                is_thinned = facts["missed"] and thinning is not None and thinning.explains(facts["rate_hz"])
+                by_site = thinning if is_thinned else None
                 if as_json:
-                    site = thinning.site if thinning is not None and facts["missed"] else None
-                    print_json({**facts, "thinned_by": site})
+                    print_json({**facts, "thinned_by": None if by_site is None else by_site.site})
                 else:
                     missed = f" missed: {facts['missed']}" if facts["missed"] else ""
-                    if missed and thinning is not None:
-                        missed = f" {thinning}"
+                    if by_site is not None:
+                        missed = f" {by_site}"
                     print_wrapped(f"average rate: {facts['rate_hz']:.3f}")
                     print_wrapped(
                         f"\tmin: {facts['min_s']:.3f}s max: {facts['max_s']:.3f}s "

@@ -203,7 +203,7 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
         return ok(stream, f"{text}, newest {silence} ago")
     lost, arrived = stats.missed + stats.dropped, statistics.count
     thinning = probe.sites.thinning(robot, stream) if lost else None  # none is lost at the site itself
-    if thinning is not None and rate_hz >= _MIN_RECEIVED * thinning.rate_hz:
+    if thinning is not None and thinning.explains(rate_hz) and rate_hz >= _MIN_RECEIVED * thinning.rate_hz:
         return ok(stream, f"{text}, {thinning}, newest {silence} ago")
     if status is not None and rate_hz < _MIN_RECEIVED * status.rate_hz:
         text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost or downsampled on the way"
