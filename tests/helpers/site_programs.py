@@ -1,7 +1,8 @@
 """The programs of several sites and of headquarters, each in the network namespace of its host.
 
-Run as ``python -c CODE ROLE NAMESPACE ARGUMENTS``; ROLE is "router", whose arguments are those of `zstate
-router`, "robots" or "headquarters". The last two reply to queries, JSON on standard input, line by line.
+Run as ``python -c CODE ROLE NAMESPACE ARGUMENTS``. ROLE is "router", whose arguments are those of `zstate
+router`, "robots" or "headquarters", or "flood" and "counter" for a link that is full. All but the first
+reply to queries, JSON on standard input, line by line.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import zenoh
 from helpers.fault_programs import ShiftedClock, enter_namespace
 from helpers.robots import RRBOT
 
@@ -40,7 +42,7 @@ def main() -> None:
         sys.argv = ["zstate", "router", *arguments]
         command()
     else:
-        {"robots": robots, "headquarters": headquarters}[role](*arguments)
+        {"robots": robots, "headquarters": headquarters, "flood": flood, "counter": counter}[role](*arguments)
 
 
 def serve(**answers: Any) -> None:
@@ -125,3 +127,35 @@ def headquarters(endpoint: str, certs: str, names: str) -> None:
             refused=lambda: dict(listener.stats.refused),
             offsets=lambda: {one.robot: one.offset_ns * 1e-9 for one in measure_offsets(session, "*")},
         )
+
+
+def counter(endpoint: str) -> None:
+    """Counts what arrives of a flood."""
+    arrived: list[int] = []
+    with connect(mode="client", endpoints=endpoint) as session:
+        session.zenoh.declare_subscriber("flood/**", lambda _: arrived.append(1))
+        serve(arrived=lambda: len(arrived))
+
+
+def flood(endpoint: str) -> None:
+    """Publishes 6 Mbit/s that wait for room on a link, and receives them on the same host."""
+    ages_s: list[float] = []
+    with (
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+    ):
+        reader.zenoh.declare_subscriber(
+            "flood/**", lambda one: ages_s.append(time.monotonic() - float(one.payload.to_string()[:20]))
+        )
+        block = zenoh.CongestionControl.BLOCK
+        keys = [writer.zenoh.declare_publisher(f"flood/{n}", congestion_control=block) for n in range(50)]
+
+        def run(seconds: float) -> dict[str, float]:
+            begin, ticks = time.monotonic(), round(seconds * RATE_HZ)
+            for tick in range(ticks):
+                for key in keys:
+                    key.put(f"{time.monotonic():020.9f}{'x' * 280}")
+                time.sleep(max(0.0, begin + (tick + 1) / RATE_HZ - time.monotonic()))
+            return {"sent": ticks * len(keys), "received": len(ages_s), "oldest_s": max(ages_s)}
+
+        serve(run=run)

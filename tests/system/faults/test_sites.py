@@ -136,3 +136,24 @@ def test_headquarters_of_three_sites_through_cuts_and_a_killed_router(
     restarted_s = hq.query("when", everyone, 30.0)
     print(f"router killed: complete {restarted_s:.2f} s after its start")
     assert restarted_s < RECOVERED_WITHIN_S + RETURN_OF_A_ROBOT_S * count
+
+
+@pytest.mark.long
+def test_nothing_within_a_site_waits_for_a_full_uplink(spawn: Spawn, hosts: NamespaceHosts):
+    """Its publishers wait for room, as those of latched values do; without the rule they are 2.8 s late."""
+    hq = Host(spawn, hosts, "hq", ("--listen", "tcp/0.0.0.0:7447"))
+    hq.start("counter", "tcp/127.0.0.1:7447")
+    uplink = f"tcp/{hosts.address('hq')}:7447"
+    site = Host(
+        spawn, hosts, "plant1", ("--site", "plant1", "--uplink", uplink, "--robot", "r1", "--wan", "cable")
+    )
+    site.start("flood", LOCAL)
+    site.query("run", 1.0)  # until headquarters has subscribed
+    until(lambda: hq.query("arrived") > 0)
+    found = site.query("run", 4.0)
+    arrived = hq.query("arrived")
+    print(
+        f"{found['sent']} sent, oldest {found['oldest_s']:.3f} s within the site; {arrived} at headquarters"
+    )
+    assert arrived < 0.7 * found["sent"], "the uplink was not full"
+    assert found["oldest_s"] < 1.0
