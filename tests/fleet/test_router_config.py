@@ -243,3 +243,8 @@ def test_the_uplink_is_told_by_protocol_or_by_interface():
 def test_an_uplink_without_usable_rates_and_robots_is_refused(rates_hz, robots, text: str):
     with pytest.raises(InvalidInput, match=text):
         uplink(rates_hz, robots)
+
+
+def test_a_router_with_an_uplink_downsamples_to_no_other_neighbour():
+    with pytest.raises(InvalidInput, match="not both"):
+        RouterConfig(downsampling=Downsampling({"tf": 1.0}, ("r1",)), uplink=uplink({}))

@@ -239,6 +239,8 @@ class RouterConfig:
     uplink: Uplink | None = None
 
     def __post_init__(self) -> None:
+        if self.downsampling is not None and self.uplink is not None:
+            raise InvalidInput("a router downsamples to all neighbours, or thins its uplink, not both")
         endpoint_list((*self.listen, *self._connected))
         check_credentials("router", self.credentials, self.listen)
         if self.credentials is not None:
