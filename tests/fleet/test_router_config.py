@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from contextlib import closing
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
 from zstate.fleet.acl import AclRoles, access_control, read_access_control
-from zstate.fleet.router_config import Downsampling, RouterConfig, access_text
+from zstate.fleet.router_config import Downsampling, RouterConfig, Uplink, access_text
 from zstate.net.config import default_config
 from zstate.net.security.credentials import Credentials
 from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.plugins import all_streams
 from zstate.transform import Transform
-from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.keys import MODEL_WRITER, stream_expression
 
 FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
 CONFIGURATIONS = {
@@ -30,6 +32,11 @@ CONFIGURATIONS = {
         credentials=FILES,
         downsampling=Downsampling({"joint_states": 10.0, "tf": 2.5}, ("r1", "r2"), ("wwan0",)),
         access_control=access_control(AclRoles(("r1",), ("desk",))),
+    ),
+    "site": RouterConfig(
+        listen=("tcp/127.0.0.1:7447",),
+        credentials=FILES,
+        uplink=Uplink("plant1", ("tls/hq.example.com:7447",), {"joint_states": 5.0, "tf": 0.0}, ("r1", "r2")),
     ),
     "users": RouterConfig(credentials=Credentials(user="r1", password="secret", users="/etc/users")),
 }
@@ -189,3 +196,55 @@ def test_downsampling_without_rates_or_robots_is_refused(rates_hz, robots, text:
 def test_namespace_prefixes_downsampled_keys():
     (section,) = Downsampling({"tf": 1.0}, ("r1",), namespace="hall/east").settings()
     assert section["rules"] == [{"key_expr": "hall/east/zstate/r1/tf", "freq": 1.0}]
+
+
+def uplink(rates_hz: dict[str, float], robots: tuple[str, ...] = ("r1", "r2"), **options: Any) -> Uplink:
+    return Uplink("plant1", ("tls/hq.example.com:7447",), rates_hz, robots, **options)
+
+
+def test_a_stream_that_passes_has_a_rule_for_each_robot_and_any_other_one_for_all():
+    """Of a key that matches two rules Zenoh takes either, another one in each run: no two rules intersect."""
+    (item,) = uplink({"joint_states": 5.0, "tf": 0.0}).settings(())["downsampling"]  # type: ignore[misc]
+    rates = {rule["key_expr"]: rule["freq"] for rule in item["rules"]}
+    passing = {key for key, rate in rates.items() if rate}
+    assert passing == {"zstate/r1/joint_states", "zstate/r2/joint_states"}
+    sampled = {stream_expression("*", row.name) for row in all_streams() if row.is_sampled}
+    assert rates.keys() - passing == sampled - {"zstate/*/joint_states"}
+    keys = [zenoh.KeyExpr(key) for key in rates]
+    assert not any(one.intersects(other) for one, other in combinations(keys, 2))
+
+
+def test_a_sample_that_comes_a_little_early_passes_too():
+    """At 5 of 50 Hz every tenth sample passes if it comes up to 8 ms early, and no ninth does."""
+    rules = uplink({"joint_states": 5.0}).settings(())["downsampling"][0]["rules"]  # type: ignore[index]
+    least_s = 1.0 / rules[0]["freq"]
+    assert 9 / 50 < least_s == pytest.approx(10 / 50 - 0.008)
+
+
+def test_the_uplink_is_told_by_protocol_or_by_interface():
+    assert uplink({}).settings(("tcp/127.0.0.1:7447",))["qos/network"][0]["link_protocols"] == ["tls"]  # type: ignore[index]
+    with pytest.raises(ConfigError, match=r"cannot be told from 'tls/\[::\]:7447'.*--wan"):
+        uplink({}).settings(("tls/[::]:7447",))
+    item = uplink({}, interfaces=("wwan0",)).settings(("tls/[::]:7447",))["downsampling"][0]  # type: ignore[index]
+    assert item["interfaces"] == ["wwan0"]
+    assert "link_protocols" not in item
+
+
+@pytest.mark.parametrize(
+    ("rates_hz", "robots", "text"),
+    [
+        ({"map": 0.0}, ("r1",), "cannot be downsampled"),
+        ({"tf": -1.0}, ("r1",), "0 for none"),
+        ({"tf": float("inf")}, ("r1",), "0 for none"),
+        ({"tf": 1.0}, (), "names no robots"),
+        ({"tf": 1.0}, ("*",), "robot name"),
+    ],
+)
+def test_an_uplink_without_usable_rates_and_robots_is_refused(rates_hz, robots, text: str):
+    with pytest.raises(InvalidInput, match=text):
+        uplink(rates_hz, robots)
+
+
+def test_a_router_with_an_uplink_downsamples_to_no_other_neighbour():
+    with pytest.raises(InvalidInput, match="not both"):
+        RouterConfig(downsampling=Downsampling({"tf": 1.0}, ("r1",)), uplink=uplink({}))

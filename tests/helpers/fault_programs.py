@@ -50,7 +50,7 @@ def main() -> None:
     role, options = sys.argv[1], json.loads(sys.argv[2])
     namespace = options.pop("namespace", None)
     if namespace:
-        _enter(namespace)
+        enter_namespace(namespace)
     roles: dict[str, Answer] = {
         "publisher": publisher,
         "odometry": odometry,
@@ -63,7 +63,7 @@ def main() -> None:
     roles[role](**options)
 
 
-def _enter(namespace: str) -> None:
+def enter_namespace(namespace: str) -> None:
     """Enters the namespace before any thread exists: a network namespace is a property of each thread."""
     libc = ctypes.CDLL(None, use_errno=True)
     with Path(f"/run/netns/{namespace}").open() as file:

@@ -24,13 +24,27 @@ CHUNK = st.one_of(
     NUMBER,
     IDENTITY,
     st.sampled_from(
-        ["zstate", "@writer", "@reader", "@clock", "@edge", "tf", "tf_static", "joint_states", "tf,tf_static"]
+        [
+            "zstate",
+            "@writer",
+            "@reader",
+            "@clock",
+            "@edge",
+            "@site",
+            "tf=5.0",
+            "tf",
+            "tf_static",
+            "joint_states",
+            "tf,tf_static",
+        ]
     ),
+    st.sampled_from(["@site", "tf=5.0", "tf=1e999", "none", "tf=x,imu=1.0"]),
     st.sampled_from(["@ros2_lv", "MP", "MS", "NN", "::,10:,:,:,,", f"::,{'1' * 5000}:,:,:,,", ":1:0:0,10"]),
 )
 FORMS = st.sampled_from(
     [
         *("zstate/{}/@writer/{}/{}", "zstate/@reader/{}/{}/{}", "zstate/{}/@clock/{}", "zstate/{}/status/{}"),
+        "zstate/@site/{}/{}/{}",
         *(
             "zstate/{}/@edge/{}/{}/{}",
             "@ros2_lv/{}/{}/{}/{}/MP/{}/{}/{}/{}/{}/{}/{}",
@@ -44,6 +58,7 @@ PARSERS: tuple[Callable[[str], object], ...] = (
     keys.READER_TOKEN.parse,
     keys.WRITER_CLOCK.parse,
     keys.EDGE_TOKEN.parse,
+    keys.SITE_TOKEN.parse,
     keys.robot_from_key,
     WriterId.parse,
     NativeWire().edge_writer_name,
@@ -263,3 +278,26 @@ def test_a_bare_frame_gets_its_robot_and_a_full_name_stays():
 def test_a_frame_name_with_control_characters_is_refused(frame: str):
     with pytest.raises(InvalidInput, match="control characters"):
         keys.full_name("r", frame)
+
+
+@given(
+    NAME.filter(bool),
+    st.dictionaries(st.sampled_from(["tf", "joint_states", "battery"]), st.floats(1e-3, 1e6)),
+    st.lists(NAME, min_size=1, unique=True),
+)
+def test_the_token_of_a_site_has_its_rates_and_robots(
+    site: str, rates_hz: dict[str, float], robots: list[str]
+):
+    try:
+        for name in (site, *robots):
+            keys.check_robot(name)
+    except InvalidInput:
+        return
+    token = keys.SITE_TOKEN.key(site, rates_hz, robots)
+    assert keys.SITE_TOKEN.parse(token) == (site, rates_hz, tuple(robots))
+
+
+@pytest.mark.parametrize("rates", ["", "tf", "tf=0", "tf=nan", "tf=inf", "tf=-1.0", "=1.0", "a b=1.0"])
+def test_a_token_of_a_site_with_unusable_rates_is_refused(rates: str):
+    with pytest.raises(InvalidInput, match="list of rates"):
+        keys.SITE_TOKEN.parse(f"zstate/@site/plant1/{rates}/r1")

@@ -4,9 +4,9 @@ Messages that no rule allows are denied. Zenoh allows a message if a rule's key 
 the message, so a robot cannot write to other robots by a wildcard either.
 
 Native wire: ``**`` does not match chunks that begin with ``@``, so each needs a key expression: history
-queries of late joiners (``@adv``), liveliness tokens (``@writer``, ``@reader``), static edges (``@edge``)
-and clocks (``@clock``). Requests for motions (``@motion``) and to an odometry (``@odometry``) are verbatim so
-that viewers cannot send them.
+queries of late joiners (``@adv``), liveliness tokens (``@writer``, ``@reader``, ``@site``), static edges
+(``@edge``) and clocks (``@clock``). Requests for motions (``@motion``) and to an odometry (``@odometry``)
+are verbatim so that viewers cannot send them.
 
 ROS 2 (rmw_zenoh_cpp): topics and services are below ``<domain>/``, history queries under ``@adv`` below
 them, and the tokens of the ROS graph under ``@ros2_lv/<domain>/``, with node and topic names in which ``%``
@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -32,6 +32,7 @@ from zstate.wire.keys import (
     MOTION,
     ODOMETRY_REQUEST,
     READER_TOKEN,
+    SITE_TOKEN,
     WRITER_CLOCK,
     WRITER_TOKEN,
     check_robot,
@@ -48,7 +49,7 @@ SUBSCRIBE = ("declare_subscriber", "query", "declare_liveliness_subscriber", "li
 
 _WRITER, _EDGE, _READER = WRITER_TOKEN.verbatim, EDGE_TOKEN.verbatim, READER_TOKEN.verbatim
 _REQUESTS = (MOTION, ODOMETRY_REQUEST)
-_VERBATIM = ("@adv", _WRITER, WRITER_CLOCK.verbatim, _EDGE, _READER)
+_VERBATIM = ("@adv", _WRITER, WRITER_CLOCK.verbatim, _EDGE, _READER, SITE_TOKEN.verbatim)
 """What viewers read although ``zstate/**`` does not match it: cached values, tokens and clocks."""
 _READING = ("NN", "MS", "SC")  # tokens of nodes, of their subscribers and of their service clients
 _NODE_TOPICS = ("rosout", "parameter_events")  # outside of all namespaces; each ROS node writes them
@@ -68,7 +69,9 @@ class AclRoles:
     stops, resets and places an odometry, and may switch the torque off; an operator does, too, and calls
     services of ROS; a timekeeper also writes the simulated time. A placer writes only static edges under its
     own name, and reads those of the robots: it places their roots, as in ``fleet/map -> r1/odom``; readers
-    with ``placers=`` accept such edges from these only. A name may have several roles. ``namespace`` is that
+    with ``placers=`` accept such edges from these only. A site is the router of one, which forwards what its
+    robots write and is given what they are: with it headquarters accepts these robots from that site alone.
+    A name may have several roles. ``namespace`` is that
     of the sessions behind the router, if they have one. ``wires``: "native", and "ros2" with its options, see
     ``_Ros2Rules``.
     Raises InvalidInput for names that cannot be names of identities.
@@ -83,10 +86,20 @@ class AclRoles:
     placers: tuple[str, ...] = ()
     commanders: tuple[str, ...] = ()
     state_viewers: tuple[str, ...] = ()
+    sites: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
 
     def __post_init__(self) -> None:
         for name in self.identities:
             check_identity(name)
+        owners: dict[str, str] = {}
+        for site, robots in self.sites.items():
+            check_robot(site, "site")
+            for robot in robots:
+                if owners.setdefault(check_robot(robot), site) != site:
+                    raise InvalidInput(
+                        f"the robot {robot!r} is given to the sites {owners[robot]!r} and {site!r}; one of "
+                        "them could write as the other's robot"
+                    )
         check_namespace(self.namespace)
         if not self.identities:
             raise InvalidInput("no role has a name; access control without names would deny everything")
@@ -94,7 +107,8 @@ class AclRoles:
     @property
     def identities(self) -> tuple[str, ...]:
         """All names, each once."""
-        return tuple(dict.fromkeys((*self.robots, *self.readers, *self.state_viewers, *self.placers)))
+        writers = (*self.robots, *self.placers, *self.sites)
+        return tuple(dict.fromkeys((*self.robots, *self.readers, *self.state_viewers, *writers)))
 
     @property
     def readers(self) -> tuple[str, ...]:
@@ -146,19 +160,25 @@ def _native_rules(roles: AclRoles) -> Grants:
     drivers = tuple(f"{root}/*/driver{end}" for end in ("", "/@adv/**"))
     shared = (*latched, *drivers, f"{root}/*/{_EDGE}/**", f"{root}/*/{_WRITER}/**", clock)
     requests = tuple(site + key.expression() for key in _REQUESTS)
-    for robot in dict.fromkeys(roles.robots):
+    writers: dict[str, tuple[str, ...]] = {robot: (robot,) for robot in roles.robots}
+    for place, names in roles.sites.items():
+        writers |= {robot: (*writers.get(robot, ()), place) for robot in names}
+    for robot, names in writers.items():
         prefix = f"{root}/{check_robot(robot)}"
         keys = (*_below(prefix), *(site + key.expression(robot) for key in _REQUESTS))
-        yield (robot,), _ingress(f"{robot} writes", PUBLISH, keys)
-        yield (robot,), _ingress(f"{robot} reads", SUBSCRIBE, keys)
-        yield (robot,), _egress(f"{robot} is given", PUBLISH, keys)
+        yield names, _ingress(f"{robot} writes", PUBLISH, keys)
+        yield names, _ingress(f"{robot} reads", SUBSCRIBE, keys)
+        yield names, _egress(f"{robot} is given", PUBLISH, keys)
+    for place in roles.sites:
+        tokens = (site + SITE_TOKEN.expression(site=place),)
+        yield (place,), _ingress(f"{place} is announced", ("liveliness_token",), tokens)
     for placer in dict.fromkeys(roles.placers):
         prefix = f"{root}/{check_robot(placer)}"
         edges = (f"{prefix}/tf_static/*", f"{prefix}/tf_static/*/@adv/**")
         tokens = (f"{prefix}/{_WRITER}/tf_static/*", f"{prefix}/{_EDGE}/**")
         names = (placer,) if placer not in roles.robots else ()
         yield names, _ingress(f"{placer} places", PUBLISH, (*edges, *tokens))
-    robots = (*roles.robots, *roles.placers)
+    robots = (*roles.robots, *roles.placers, *roles.sites)
     yield robots, _ingress("robots read", SUBSCRIBE, shared)
     yield robots, _egress("robots are given", PUBLISH, shared)
     # A query for all robots goes to each of them; a reply has the robot's own data only.
@@ -327,6 +347,8 @@ def _wire_rules(roles: AclRoles, wire: str) -> Grants:
         raise InvalidInput(
             f"there is no access control for the wire {wire!r}; there is for 'native' and 'ros2'"
         )
+    if roles.sites:
+        raise InvalidInput("the uplink of a site carries the native wire; leave out --site, or --wire ros2")
     if roles.namespace:
         raise InvalidInput(
             f"ROS nodes have no Zenoh namespace, such as {roles.namespace!r}; write 'ros2:namespace=NAME' "

@@ -8,22 +8,23 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.fleet.acl import AclRoles, access_control, check_namespace
+from zstate.fleet.acl import AclRoles, Rule, access_control, check_namespace
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.credentials import Credentials
-from zstate.plugins import edge_streams
+from zstate.plugins import streams_where
 from zstate.streams import StreamName
-from zstate.wire.keys import check_robot, stream_expression
+from zstate.wire.keys import ANY, check_robot, stream_expression
 
 
 def downsampled_streams() -> tuple[StreamName, ...]:
-    """The streams that may lose samples: each is replaced by a newer one."""
-    return ("joint_states", "partial_joint_states", "tf", *edge_streams())
+    """The streams that may lose samples, those of other packages as well: each is replaced by a newer one."""
+    return streams_where(lambda row: row.is_sampled)
 
 
 _WIDTH = 100
@@ -48,33 +49,126 @@ class Downsampling:
 
     def __post_init__(self) -> None:
         check_namespace(self.namespace)
-        for stream, rate_hz in self.rates_hz.items():
-            if stream not in downsampled_streams():
-                raise InvalidInput(
-                    f"{stream!r} cannot be downsampled; {', '.join(downsampled_streams())} can"
-                )
-            if not (math.isfinite(rate_hz) and rate_hz > 0.0):
-                raise InvalidInput(f"{stream!r} at {rate_hz} Hz; give a positive number of samples a second")
+        _check_rates(self.rates_hz)
         if not self.rates_hz or not self.robots:
             # One rule for all robots would limit their sum, and starve some.
             raise InvalidInput(
                 "downsampling needs streams and the names of the robots: each has a limit of its own"
             )
+        for robot in self.robots:
+            check_robot(robot)
 
     def settings(self) -> list[dict[str, object]]:
         """The section ``downsampling`` of a Zenoh configuration."""
         interfaces = {"interfaces": list(self.interfaces)} if self.interfaces else {}
-        prefix = f"{self.namespace}/" if self.namespace else ""
-        rules = [
-            {
-                "key_expr": prefix + stream_expression(check_robot(robot), stream),
-                "freq": self.rates_hz[stream],
-            }
-            for robot in dict.fromkeys(self.robots)
-            for stream in downsampled_streams()
-            if stream in self.rates_hz
-        ]
+        rules = _rules(self.rates_hz, self.robots, self.namespace)
         return [{"id": "streams", **interfaces, "flows": ["egress"], "messages": ["put"], "rules": rules}]
+
+
+def _check_rates(rates_hz: Mapping[StreamName, float], least_hz: float = sys.float_info.min) -> None:
+    for stream, rate_hz in rates_hz.items():
+        if stream not in downsampled_streams():
+            raise InvalidInput(f"{stream!r} cannot be downsampled; {', '.join(downsampled_streams())} can")
+        if not least_hz <= rate_hz < math.inf:
+            what = "a positive number of samples a second" if least_hz else "samples a second, 0 for none"
+            raise InvalidInput(f"{stream!r} at {rate_hz} Hz; give {what}")
+
+
+def _rules(rates_hz: Mapping[StreamName, float], robots: Iterable[str], namespace: str) -> list[Rule]:
+    """One rule for each robot: they would share the samples that one rule of all lets pass."""
+    prefix = f"{namespace}/" if namespace else ""
+    return [
+        {"key_expr": prefix + stream_expression(robot, stream), "freq": rates_hz[stream]}
+        for robot in dict.fromkeys(robots)
+        for stream in downsampled_streams()
+        if stream in rates_hz
+    ]
+
+
+_EARLY = 0.96
+"""A sample passes this part of the period after the last one: one that comes a little early passes as well,
+and 50 Hz at 5 Hz gives 5 Hz, not every eleventh sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class Uplink:
+    """The link from the router of ``site`` to those of headquarters at ``endpoints``, and what passes on it.
+
+    ``rates_hz`` is the limit by stream, for each of ``robots``. Of streams at 0, and of those without a rate,
+    no sample passes, of any robot. Latched values, commands, stops, tokens, the simulated time, queries and
+    their replies always pass; samples and values are dropped if the link is full, and never wait.
+
+    ``interfaces`` are the network interfaces of the link. Without them it is told from the local ones by its
+    protocol. Raises InvalidInput.
+    """
+
+    site: str
+    endpoints: tuple[str, ...]
+    rates_hz: Mapping[StreamName, float]
+    robots: tuple[str, ...]
+    interfaces: tuple[str, ...] = ()
+    namespace: str = ""
+
+    def __post_init__(self) -> None:
+        check_robot(self.site, "site")
+        check_namespace(self.namespace)
+        _check_rates(self.rates_hz, 0.0)
+        for robot in self.robots:
+            check_robot(robot)
+        if not self.endpoints:
+            raise InvalidInput(f"the site {self.site!r} has no uplink; give the endpoint of headquarters")
+        if not self.robots:
+            raise InvalidInput(
+                f"the site {self.site!r} names no robots: each has a limit of its own on the uplink; give "
+                "their names (--robot NAME, or --robot-file FILE with one name on each line)"
+            )
+
+    @property
+    def passing(self) -> tuple[StreamName, ...]:
+        """The streams of samples that pass, thinned."""
+        return tuple(stream for stream, rate_hz in self.rates_hz.items() if rate_hz)
+
+    @property
+    def text(self) -> str:
+        """What passes, in a sentence."""
+        rates = [f"{stream} at {self.rates_hz[stream]:g} Hz" for stream in self.passing]
+        count, robots = len(set(self.robots)), "robot" if len(set(self.robots)) == 1 else "robots"
+        return (
+            f"{' and '.join(rates) or 'no samples'} of {count} {robots} leave for {', '.join(self.endpoints)}"
+        )
+
+    def settings(self, others: Sequence[str]) -> dict[str, object]:
+        """The sections ``downsampling`` and ``qos`` of a Zenoh configuration.
+
+        ``others`` are the endpoints of all other links of the router. Raises ConfigError if the uplink cannot
+        be told from them.
+        """
+        passing = {stream: self.rates_hz[stream] / _EARLY for stream in self.passing}
+        # Of a key that matches two rules Zenoh takes any of them: no rule for all of a stream that passes.
+        blocked = {stream: 0.0 for stream in downsampled_streams() if stream not in passing}
+        rules = [*_rules(passing, self.robots, self.namespace), *_rules(blocked, (ANY,), self.namespace)]
+        uplink = {**self._link(others), "flows": ["egress"], "messages": ["put"]}
+        overwrite = {"key_exprs": ["**", "**/@adv/**"], "overwrite": {"congestion_control": "drop"}}
+        return {
+            "downsampling": [{"id": "uplink", **uplink, "rules": rules}],
+            "qos/network": [{"id": "uplink", **uplink, **overwrite}],
+        }
+
+    def _link(self, others: Sequence[str]) -> dict[str, list[str]]:
+        """What tells the uplink from other links."""
+        if self.interfaces:
+            return {"interfaces": list(self.interfaces)}
+        protocols = {endpoint.partition("/")[0] for endpoint in self.endpoints}
+        if shared := protocols & {endpoint.partition("/")[0] for endpoint in others}:
+            protocol = min(shared)
+            alike = next(endpoint for endpoint in others if endpoint.startswith(f"{protocol}/"))
+            raise ConfigError(
+                f"the uplink {self.endpoints[0]!r} cannot be told from {alike!r}: both are {protocol}, and "
+                "links are thinned by protocol or network interface; give the interface of the uplink (--wan "
+                "wwan0), or choose another protocol for one of the two, such as quic for the uplink",
+                path="uplink",
+            )
+        return {"link_protocols": sorted(protocols)}
 
 
 _ACCESS_HEAD = """\
@@ -108,6 +202,7 @@ _COMMENTS = {
     "transport/auth": "Users that may connect, with passwords.",
     "transport/shared_memory": "No gain for messages this small.",
     "downsampling": "Limit of samples per second [Hz] to each neighbour, by rule, not by key.",
+    "qos": "Samples and values that leave on the uplink are dropped if it is full; none waits.",
     "access_control": "Allowed messages by identity; all others are denied.",
 }
 _ROS_COMMENTS = {
@@ -117,15 +212,15 @@ _ROS_COMMENTS = {
     "transport/link/tx": "",
     "transport/unicast": "",
 }
-_ACCESS_COMMENTS = {
-    "scouting/gossip": "Gossip lets peers link directly, past access control.\n"
+_GOSSIP_COMMENTS = {
+    "scouting/gossip": "Gossip lets peers link directly, past the rules of this router.\n"
     'Without it peers receive nothing from each other: connect with mode "client", ROS nodes too.',
 }
 
 
 @dataclass(frozen=True, slots=True)
 class RouterConfig:
-    """A router: endpoints, credentials, downsampling and access control.
+    """A router: endpoints, credentials, downsampling, access control, and the uplink of a site.
 
     It listens at ``tcp/127.0.0.1:7447`` by default. ``access_control`` is that section of a Zenoh
     configuration, and needs credentials that identify clients; it turns gossip off, because peers that
@@ -141,13 +236,16 @@ class RouterConfig:
     downsampling: Downsampling | None = None
     access_control: Mapping[str, object] = field(default_factory=dict[str, object])
     ros2: bool = False
+    uplink: Uplink | None = None
 
     def __post_init__(self) -> None:
-        endpoint_list((*self.listen, *self.connect))
+        if self.downsampling is not None and self.uplink is not None:
+            raise InvalidInput("a router downsamples to all neighbours, or thins its uplink, not both")
+        endpoint_list((*self.listen, *self._connected))
         check_credentials("router", self.credentials, self.listen)
         if self.credentials is not None:
             exposed = [endpoint for endpoint in self.listen if not endpoint.startswith(_PRIVATE)]
-            self.credentials.check_endpoints(self.connect, exposed)
+            self.credentials.check_endpoints(self._connected, exposed)
         identifies = self.credentials and (self.credentials.certificate or self.credentials.users)
         if self.access_control and not identifies:
             raise ConfigError(
@@ -156,18 +254,27 @@ class RouterConfig:
                 path="access_control",
             )
 
+    @property
+    def _connected(self) -> tuple[str, ...]:
+        """The endpoints of the routers that it joins."""
+        return (*self.connect, *(self.uplink.endpoints if self.uplink is not None else ()))
+
     def settings(self) -> dict[str, object]:
-        """The Zenoh configuration."""
+        """The Zenoh configuration. Raises ConfigError for an uplink that cannot be told from other links."""
         settings: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
-        if self.connect:
-            settings |= {"connect/endpoints": list(self.connect), **_CONNECT_SETTINGS}
+        if self._connected:
+            settings |= {"connect/endpoints": list(self._connected), **_CONNECT_SETTINGS}
         settings |= ROS_ROUTER if self.ros2 else _NATIVE_SETTINGS
         if self.credentials is not None:
             settings |= self.credentials.settings()
         if self.downsampling is not None:
             settings["downsampling"] = self.downsampling.settings()
+        if self.uplink is not None:
+            settings |= self.uplink.settings((*self.listen, *self.connect))
+        if self.access_control or self.uplink is not None:
+            settings["scouting/gossip/enabled"] = False
         if self.access_control:
-            settings |= {"scouting/gossip/enabled": False, "access_control": self.access_control}
+            settings["access_control"] = self.access_control
         nested: dict[str, Any] = {}
         _merge(nested, settings)
         return nested
@@ -175,8 +282,8 @@ class RouterConfig:
     def text(self, *, masked: bool = False) -> str:
         """The configuration as commented JSON5; if ``masked``, with asterisks for the password."""
         comments = _COMMENTS | (_ROS_COMMENTS if self.ros2 else {})
-        if self.access_control:
-            comments |= _ACCESS_COMMENTS
+        if self.access_control or self.uplink is not None:
+            comments |= _GOSSIP_COMMENTS
         settings = self.settings()
         if masked and self.credentials is not None and self.credentials.password is not None:
             _merge(settings, {"transport/auth/usrpwd/password": "********"})
@@ -206,6 +313,7 @@ def access_text(roles: AclRoles) -> str:
         "commanders": roles.commanders,
         "timekeepers": roles.timekeepers,
         "placers": roles.placers,
+        "sites": [f"{site} ({', '.join(robots)})" for site, robots in roles.sites.items()],
     }
     if roles.wires != ("native",):
         names["wires"] = roles.wires

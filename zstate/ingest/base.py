@@ -169,14 +169,18 @@ class StreamIngest(ABC):
             self._numbers.next, stamp = advanced
             self._set_newest(self._fast_order, stamp)
 
-    def insert_history(self, samples: Sequence[Sample]) -> bool:
+    def insert_history(self, samples: Sequence[Sample], *, are_missing: bool = False) -> bool:
         """Insert samples from the writer's cache, oldest first; True if still older ones are wanted.
 
+        With ``are_missing`` all of them are inserted: of a thinned stream more are missing than are noted.
         Inserts only missing samples, counted as "recalled". They are inserted newest first: the known
         history grows backwards, so that it never has a gap that is about to be filled. Those that fill a gap
         between others are inserted together, because each insert there copies the history.
         """
         self.has_data = True
+        if are_missing:
+            with self._lock:
+                self._numbers.missing.add(samples[0].seq, samples[-1].seq + 1)
         together = self._insert_past_counted(samples)
         for sample in reversed(samples[: len(samples) - together]):
             with self._lock:  # for each, so that live samples need not wait for all

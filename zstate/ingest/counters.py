@@ -24,10 +24,10 @@ class ListenerStats:
     """Counts since the listener opened.
 
     ``received`` samples were inserted; ``dropped`` were lost in the listener's own full ring, ``missed``
-    between the writer's sequence numbers; ``late`` were older than the history; ``refused`` counts samples
-    that could not be used, by reason. ``recalled`` samples are history from before the listener opened, sent
-    from the writers' caches; ``off_clock`` had stamps more than a minute from the clock here, and were
-    inserted all the same.
+    between the writer's sequence numbers, those that a router thins as well; ``late`` were older than the
+    history; ``refused`` counts samples that could not be used, by reason. ``recalled`` samples are from the
+    writers' caches: history from before the listener opened, and what exact lookups requested; ``off_clock``
+    had stamps more than a minute from the clock here, and were inserted all the same.
     """
 
     received: int

@@ -16,6 +16,7 @@ from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError, Unreachable
 from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
+from zstate.net.sites import NO_SITES, Sites, Thinning
 from zstate.net.status_monitor import StatusMonitor, WriterState
 from zstate.plugins import edge_streams
 from zstate.streams import StreamName
@@ -40,7 +41,8 @@ class StreamUse:
     """One stream of ``robot`` with the programs that write and read it, each once, sorted.
 
     A ROS topic belongs to no robot: ``robot`` is empty, ``name`` is the topic with its namespace.
-    ``rate_hz`` is None for latched streams and if it was not measured.
+    ``rate_hz`` is None for latched streams and if it was not measured; ``thinning`` is that of its site, if
+    the robot has one.
     """
 
     robot: str
@@ -48,11 +50,14 @@ class StreamUse:
     writers: tuple[str, ...]
     readers: tuple[str, ...]
     rate_hz: float | None = None
+    thinning: Thinning | None = None
 
     @property
     def label(self) -> str:
-        """The name, and the rate if it is known."""
-        return self.name if self.rate_hz is None else f"{self.name} ({self.rate_hz:.1f} Hz)"
+        """The name, the rate if it is known, and what passes of it beyond the robot's site."""
+        rate = "" if self.rate_hz is None else f"{self.rate_hz:.1f} Hz"
+        facts = ", ".join(filter(None, (rate, str(self.thinning or ""))))
+        return f"{self.name} ({facts})" if facts else self.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +100,10 @@ def _is_optional(stream: StreamName) -> bool:
 
 
 def build_graph(
-    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateLookup | None = None
+    robots: Sequence[RobotInfo],
+    readers: Sequence[Announcement],
+    rate_of: RateLookup | None = None,
+    sites: Sites = NO_SITES,
 ) -> Graph:
     """The graph of discovered writers and readers.
 
@@ -133,7 +141,8 @@ def build_graph(
             rates = (rate_of(robot, stream, writer) for writer in writers) if rate_of else ()
             rate_hz = next((rate for rate in rates if rate is not None), None)
             label = f"{stream}/{name}" if name else stream
-            uses.append(StreamUse(robot, label, programs(writers), reading, rate_hz))
+            thinning = sites.thinning(robot, stream) if writers else None
+            uses.append(StreamUse(robot, label, programs(writers), reading, rate_hz, thinning))
     return Graph(tuple(uses))
 
 

@@ -175,7 +175,7 @@ class HistoryRequest(Request):
 
     ``on_page(samples, writer)`` is called in the thread of the requests; the samples of a page are oldest
     first. It returns whether to request older ones. A request without a reply is repeated a few times; a page
-    that cannot be decoded goes to ``on_error``.
+    that cannot be decoded goes to ``on_error``. ``on_done()`` is called once no more requests follow.
     """
 
     def __init__(
@@ -184,7 +184,9 @@ class HistoryRequest(Request):
         writer: int,
         on_page: Callable[[list[SerializedSample], int], bool],
         on_error: Callable[[str, MessageError], None],
+        on_done: Callable[[], object] = lambda: None,
     ) -> None:
+        self._on_done = on_done
         self.source = self._key = key
         self._writer = writer
         self._on_page = on_page
@@ -214,6 +216,12 @@ class HistoryRequest(Request):
             self._reply = reply.ok
 
     def on_end(self) -> float | None:
+        delay_s = self._on_page_end()
+        if delay_s is None:
+            self._on_done()
+        return delay_s
+
+    def _on_page_end(self) -> float | None:
         if self._reply is None:
             # The token of a new writer may be known before its queryable; or a page was lost.
             self._attempts += 1

@@ -20,6 +20,7 @@ from zstate.net.presence import announced_robots
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.nodes.state_reader import StateReader
+from zstate.transform import Transform
 from zstate.wire.keys import ANY, check_robot, shortened
 from zstate.wire.protocol import Wire, selected_robots
 from zstate.wire.registry import get_wire
@@ -133,6 +134,33 @@ class TransformListener(Closeable):
             from zstate._util.other_names import missing_method  # noqa: PLC0415 - for mistakes alone
 
             raise missing_method(self, name, self.__dict__.get("buffer"))
+
+    def lookup(
+        self,
+        target: str,
+        source: str,
+        at: int | None = None,
+        *,
+        exact: bool = False,
+        timeout_s: float = 1.0,
+    ) -> Transform:
+        """``buffer.lookup(target, source, at)``; with ``exact`` the writers are asked for all their samples.
+
+        A router between may thin the samples, and then a lookup interpolates over long intervals. With
+        ``exact`` the samples around ``at`` that are missing are requested from the writers that move the
+        path, for up to ``timeout_s`` [s], and inserted: the answer equals that of a listener next to them.
+        Writers keep their last seconds (their ``cache_s``). Raises as ``buffer.wait``, and Unreachable if a
+        writer does not reply. On the ROS wires raises InvalidInput.
+        """
+        if not exact:
+            return self.buffer.lookup(target, source, at)
+        if self._wire.name != "native":
+            raise InvalidInput(
+                f"exact=True needs the native wire; nodes of {self._wire.name!r} keep no samples"
+            )
+        from zstate.nodes.exact_lookup import ExactLookup  # noqa: PLC0415 - for thinned streams alone
+
+        return ExactLookup(self.buffer, self._reader).lookup(target, source, at, timeout_s)
 
     @property
     def stats(self) -> ListenerStats:

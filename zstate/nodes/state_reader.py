@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
@@ -10,9 +11,10 @@ from typing import ParamSpec, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import FAR_NS, LATE_NS, SystemClock
+from zstate.clock import FAR_NS, LATE_NS, SystemClock, wait_interruptible
 from zstate.errors import InvalidInput, MessageError
 from zstate.extension import kernel
+from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.diagnostics import Diagnostics
 from zstate.ingest.robot_ingests import Follow, RobotIngests
@@ -69,7 +71,11 @@ class StateReader(Closeable):
         self.ingests = RobotIngests(
             buffer, counters, wire, follow, placers=placers, diagnostics=self._diagnostics
         )
-        self._history: Requests | None = None
+        self._has_history = history_on_join
+        self._requests = Requests(session, thread, MAX_IN_FLIGHT)
+        self._on_page = self._observed(self._on_history)
+        self._announced: set[Announcement] = set()
+        """The writers with a cache of samples."""
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             latched: dict[StreamName, Callable[[SerializedSample], None]] = {
@@ -81,9 +87,6 @@ class StateReader(Closeable):
                     LatchedSubscriber(session, self._keys(stream), self._observed(handle), thread=thread)
                 )
             self._other_tf = self._subscribe_to_samples(opening)
-            if history_on_join and wire.name == "native":
-                self._history = Requests(session, thread, MAX_IN_FLIGHT)
-                self._on_page = self._observed(self._on_history)
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
             opening.enter_context(WriterWatch(session, robots, on_writer, wire, on_cut_off))
@@ -182,8 +185,58 @@ class StateReader(Closeable):
             for notify in self._observers:  # not by _observed(), whose call costs 0.2 us
                 notify()
 
+    @property
+    def announced(self) -> frozenset[Announcement]:
+        """The writers of samples that may have a cache."""
+        return frozenset(self._announced.copy())
+
+    def recall(
+        self, writers: Collection[Announcement], stamp: int, timeout_s: float
+    ) -> dict[Announcement, tuple[int, int]]:
+        """Request the samples that ``writers`` cached, back to ``stamp`` [ns], and insert them.
+
+        Returns the oldest and the newest of their stamps, between which nothing is missing, of each writer
+        that replied within ``timeout_s`` [s].
+        """
+        spans: dict[Announcement, tuple[int, int]] = {}
+        waiting, done = len(writers), threading.Event()
+
+        def on_page(one: Announcement, arrivals: list[SerializedSample], writer: int) -> bool:
+            samples = self._read_history(arrivals, writer)
+            if not samples:
+                return False
+            self._ingest_of(arrivals[0].key, writer).insert_history(samples, are_missing=True)
+            oldest, newest = samples[0].stamp, samples[-1].stamp
+            spans[one] = oldest, max(newest, spans.get(one, (0, newest))[1])
+            return oldest > stamp
+
+        def on_done() -> None:
+            nonlocal waiting
+            waiting -= 1
+            if waiting <= 0:
+                done.set()
+
+        for one in writers:
+            key = stream_key(one.robot, one.stream, one.name)
+            on_page_of = self._observed(partial(on_page, one))
+            session = one.writer.session
+            self._requests.add(HistoryRequest(key, session, on_page_of, self._count_undecodable, on_done))
+        if writers:
+            wait_interruptible(done, timeout_s)
+        return spans.copy()
+
     def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
         """Insert a page of the cache of the session ``writer``; True if older samples are wanted."""
+        samples = self._read_history(arrivals, writer)
+        return bool(samples) and self._ingest_of(arrivals[0].key, writer).insert_history(samples)
+
+    def _ingest_of(self, key: str, writer: int) -> StreamIngest:
+        return self.ingests.find(
+            self.ingests.streams[stream_from_key(key)], self._robot_from_key(key), writer
+        )
+
+    def _read_history(self, arrivals: list[SerializedSample], writer: int) -> list[Sample]:
+        """The samples of a page of the cache of the session ``writer``; none if they are of another one."""
         robot = self._robot_from_key(arrivals[0].key)  # the key of the request
         stream = stream_from_key(arrivals[0].key)
         messages = (message for one in arrivals for message in self._decode(stream, one, robot))
@@ -191,10 +244,8 @@ class StateReader(Closeable):
         if any(sample.session != writer for sample in samples):
             text = f"{robot!r}: samples of another session than {writer}, whose history was requested"
             self._counters.count_refusal("foreign answer", text)
-            return False
-        if not samples:
-            return False
-        return self.ingests.find(self.ingests.streams[stream], robot, writer).insert_history(samples)
+            return []
+        return samples
 
     def _on_description(self, arrival: SerializedSample) -> None:
         try:
@@ -252,6 +303,7 @@ class StateReader(Closeable):
             self.ingests.add_writer(announced)
             self._request_history(announced)
         else:
+            self._announced.discard(announced)
             self.ingests.remove_writer(announced)
 
     def _request_history(self, announced: Announcement) -> None:
@@ -259,8 +311,9 @@ class StateReader(Closeable):
         stream = announced.stream
         # A token without a name leaves open on which key of a named stream its writer publishes.
         has_key = bool(announced.name) or not is_named(stream)
-        if self._history is not None and stream in self.ingests.streams and has_key:
-            key = stream_key(announced.robot, stream, announced.name)
-            self._history.add(
-                HistoryRequest(key, announced.writer.session, self._on_page, self._count_undecodable)
-            )
+        if self._wire.name != "native" or stream not in self.ingests.streams or not has_key:
+            return
+        self._announced.add(announced)
+        if self._has_history:
+            key, session = stream_key(announced.robot, stream, announced.name), announced.writer.session
+            self._requests.add(HistoryRequest(key, session, self._on_page, self._count_undecodable))

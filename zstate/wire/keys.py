@@ -10,7 +10,8 @@ has one token for all, because what tokens cost a router grows with the square o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVarTuple, cast
 from urllib.parse import quote, unquote
@@ -153,6 +154,36 @@ _NAME_CHUNKS = {
 }
 _READER_ROBOT = _Chunk(_quoted, _read_reader_robot)
 
+_NO_RATE = "none"
+
+
+def _write_rates(rates_hz: Mapping[StreamName, float]) -> str:
+    return ",".join(f"{stream}={rate_hz!r}" for stream, rate_hz in rates_hz.items()) or _NO_RATE
+
+
+def _read_rates(chunk: str) -> dict[StreamName, float]:
+    pairs = [] if chunk == _NO_RATE else [pair.partition("=") for pair in chunk.split(",")]
+    try:
+        rates_hz = {stream: float(rate) for stream, _, rate in pairs}
+    except ValueError:
+        rates_hz = {"": 0.0}
+    if not all(stream.isidentifier() and 0.0 < rate < math.inf for stream, rate in rates_hz.items()):
+        raise InvalidInput(f"{shortened(chunk)!r} is not a list of rates such as 'joint_states=5.0,imu=1.0'")
+    return rates_hz
+
+
+def _write_robots(robots: Sequence[str]) -> str:
+    return ",".join(map(_quoted, robots))
+
+
+def _read_robots(chunk: str) -> tuple[str, ...]:
+    return tuple(check_robot(unquote(name)) for name in chunk.split(","))
+
+
+def _check_site(name: str) -> str:
+    return check_robot(name, "site")
+
+
 Values = TypeVarTuple("Values")
 
 
@@ -238,6 +269,18 @@ READER_TOKEN = Key[str, Sequence[StreamName], str](
     "zstate/@reader/<robot>/<streams>/<identity>", robot=_READER_ROBOT
 )
 """The liveliness token of one reader of a robot or of all, ``"*"``. Readers write below no robot's prefix."""
+
+SITE_TOKEN = Key[str, Mapping[StreamName, float], Sequence[str]](
+    "zstate/@site/<site>/<rates>/<robots>",
+    site=_Chunk(_check_site, _check_site),
+    rates=_Chunk(_write_rates, _read_rates),
+    robots=_Chunk(_write_robots, _read_robots),
+)
+"""The liveliness token of the router of a site, which thins what leaves on its uplink.
+
+Of each of the robots, these streams pass at these rates [Hz], and no other samples. A site with many robots
+has several tokens.
+"""
 
 STOP = Key[str, str]("zstate/<robot>/stop/<identity>")
 """The Stop of one program, latched: the driver's joints hold."""

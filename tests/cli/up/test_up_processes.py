@@ -97,6 +97,20 @@ def test_keys_of_the_router_are_options_of_its_command_only(folder: Path):
     assert found["rrbot"].endswith("--mode client --connect tls/127.0.0.1:7001")
 
 
+def test_the_router_of_a_site_thins_the_robots_of_the_file_and_serves_them_without_certificates(folder: Path):
+    router = (
+        "[router]\nsite = 'plant1'\nuplink = ['tls/10.0.0.2:7447']\ncerts = 'certs'\nidentity = 'plant1'\n"
+        "thin = { joint_states = 5, tf = 0 }\n"
+    )
+    found = commands(folder, router + ROBOT)
+    assert found["router"].endswith(
+        "--listen tcp/127.0.0.1:7447 --site plant1 --uplink tls/10.0.0.2:7447 --thin joint_states=5 "
+        f"--thin tf=0 --robot rrbot --certs {folder / 'certs'} --identity plant1"
+    )
+    assert "--connect tcp/127.0.0.1:7447" in found["rrbot"]
+    assert "--robot r9" in commands(folder, router + "robot = ['r9']\n" + ROBOT)["router"]
+
+
 def test_a_router_with_certificates_listens_with_tls_by_default(folder: Path):
     assert "--listen tcp/127.0.0.1:7447" in commands(folder, "[router]\n")["router"]
     assert "--listen tls/127.0.0.1:7447" in commands(folder, "[router]\ncerts = 'certs'\n")["router"]

@@ -19,11 +19,12 @@ from helpers.cli_runner import (
 )
 from helpers.processes import until
 from helpers.programs import router
-from helpers.robots import SampleCollector
+from helpers.robots import RRBOT, SampleCollector
 
-from zstate import TransformListener, connect
+from zstate import StatePublisher, TransformListener, connect
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session
+from zstate.net.sites import discover_sites
 
 
 @pytest.mark.processes
@@ -197,3 +198,48 @@ def test_password_is_in_the_output_file_but_masked_in_print(tmp_path: Path, monk
     assert file.read_text() == printed.replace("********", "open sesame")
     assert file.stat().st_mode & 0o777 == 0o600
     assert f"'{file}' cannot be written: File exists" in failure(*options, "--output", str(file))
+
+
+def test_a_site_prints_what_passes_and_runs_it(free_port: int, tmp_path: Path):
+    """Its own programs are told from headquarters by the protocol: a socket file here."""
+    headquarters = f"tcp/127.0.0.1:{free_port}"
+    local = f"unixsock-stream/{tmp_path / 'site.sock'}"
+    (tmp_path / "robots.txt").write_text("# plant 1\nr1\nr2  # the second\n")
+    site = ("--site", "plant1", "--uplink", headquarters, "--thin", "joint_states=5,tf=0", "--listen", local)
+    arguments = ("router", *site, "--robot-file", str(tmp_path / "robots.txt"))
+
+    def run(command: Command) -> None:
+        assert command.line().endswith(f" listens at {local}")
+        sentence = f"site 'plant1': joint_states at 5 Hz of 2 robots leave for {headquarters}"
+        assert command.line() == sentence
+        with connect(mode="client", endpoints=headquarters) as far:
+            until(lambda: discover_sites(far).robots == {"plant1": frozenset({"r1", "r2"})})
+            with connect(mode="client", endpoints=local) as near, StatePublisher(near, RRBOT, "r3"):
+                until(lambda: "'r3' has no rule" in command.stderr)
+
+    with router(headquarters):
+        run_watched(run, *arguments)
+    printed = json.loads(str(zenoh.Config.from_json5(run_cli(*arguments, "--print").stdout)))
+    rules = printed["downsampling"][0]["rules"]
+    assert [one["key_expr"] for one in rules if one["freq"]] == [f"zstate/r{n}/joint_states" for n in (1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--uplink", "tls/hq:7447"), "--uplink and --thin need --site"),
+        (("--site", "plant1", "--robot", "r1"), "has no uplink"),
+        (("--site", "plant1", "--uplink", "tls/hq:7447"), "names no robots"),
+        (("--site", "plant1", "--uplink", "tls/hq:7447", "--downsample", "tf=1"), "exclude each other"),
+        (("--site", "plant1", "--uplink", "tls/hq:7447", "--ros2"), "exclude each other"),
+        (("--site", "plant1", "--uplink", "tcp/hq:7447", "--robot", "r1"), "cannot be told from"),
+        (
+            ("--site", "plant1", "--uplink", "tls/hq:7447", "--robot", "r1", "--thin", "joints=5"),
+            "'joints' cannot",
+        ),
+    ],
+)
+def test_options_of_a_site_that_do_not_fit_are_refused(arguments: tuple[str, ...], text: str):
+    ended = run_cli("router", *arguments, "--print")
+    assert ended.code in {1, 2}
+    assert text in ended.stderr

@@ -79,6 +79,7 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.cli.robot_directory import check_found
     from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
+    from zstate.net.sites import discover_sites
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
     from zstate.plugins import edge_streams, measured_streams
     from zstate.wire.keys import ANY
@@ -95,7 +96,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         statistics.watch(always)
         robots = discover(session)
         check_found(robots)
-        readers = discover_readers(session, _READERS_WITHIN_S)
+        readers, sites = discover_readers(session, _READERS_WITHIN_S), discover_sites(session)
         # tf is published only while it is read: measuring must not make a publisher start.
         read = {one.robot for one in readers if one.stream == "tf"}
         moving: set[tuple[str, StreamName]] = {(robot.name, stream) for robot in robots for stream in always}
@@ -114,7 +115,7 @@ def _discover_measured_graph(session: Session) -> Graph:
         def rate_hz(robot: str, stream: StreamName, writer: WriterId) -> float | None:
             return statistics.published_hz(WriterKey(robot, stream, writer.session))
 
-        return build_graph(robots, readers, rate_hz)
+        return build_graph(robots, readers, rate_hz, sites)
 
 
 def graph_text(graph: Graph) -> str:
@@ -165,6 +166,8 @@ def _graph_facts(graph: Graph) -> dict[str, Any]:
             "robot": stream.robot,
             "stream": stream.name,
             "rate_hz": stream.rate_hz,
+            "site": stream.thinning.site if stream.thinning else None,
+            "thinned_hz": stream.thinning.rate_hz if stream.thinning else None,
             "writers": list(stream.writers),
             "readers": list(stream.readers),
         }

@@ -70,6 +70,7 @@ def hz_command(
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.stream_reader import StreamReader
+    from zstate.net.sites import discover_sites
     from zstate.plugins import is_named
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
@@ -82,6 +83,7 @@ def hz_command(
         open_session(network, (wire,)) as session,
         StreamReader(session, named_robot(session, robot, wire), stream, wire) as reader,
     ):
+        thinning = None if is_ros(wire) else discover_sites(session).thinning(reader.robot, stream)
         statistics = MessageStatistics(window, of_all=of_all)
         reader.first(timeout if once else seconds)
         _read_for(_SETTLING_S, reader, MessageStatistics(2))  # what queued up while this process was starting
@@ -90,10 +92,14 @@ def hz_command(
         while time.monotonic() < end:
             count, facts = _read_for(1.0, reader, statistics), statistics.facts()
             if facts is not None and (count or once):
+                is_thinned = facts["missed"] and thinning is not None and thinning.explains(facts["rate_hz"])
+                by_site = thinning if is_thinned else None
                 if as_json:
-                    print_json(facts)
+                    print_json({**facts, "thinned_by": None if by_site is None else by_site.site})
                 else:
                     missed = f" missed: {facts['missed']}" if facts["missed"] else ""
+                    if by_site is not None:
+                        missed = f" {by_site}"
                     print_wrapped(f"average rate: {facts['rate_hz']:.3f}")
                     print_wrapped(
                         f"\tmin: {facts['min_s']:.3f}s max: {facts['max_s']:.3f}s "

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from zstate.net.graph import RosEndpoint, RosGraph
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.net.sites import Sites
     from zstate.net.topic_statistics import TopicStatistics
     from zstate.streams import StreamName
     from zstate.wire.identity import WriterId
@@ -98,6 +99,7 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_directory import RobotDirectory, check_found
     from zstate.net.presence import discover
+    from zstate.net.sites import discover_sites
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
     from zstate.plugins import streams_where
     from zstate.wire.registry import get_wire
@@ -105,12 +107,13 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     def text(robots: tuple[RobotInfo, ...]) -> str:
         if not robots:
             return messages_for("native").announced(robots)
-        return robots_text(robots, statistics, width=output_width())
+        return robots_text(robots, statistics, sites, width=output_width())
 
     with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         measured_streams = streams_where(lambda row: row.is_measured or row.group in ("joints", "edges"))
         statistics.watch(measured_streams)
-        facts = partial(_robots_facts, statistics=statistics)
+        sites = discover_sites(session)
+        facts = partial(_robots_facts, statistics=statistics, sites=sites)
         if watch:
             with RobotDirectory(session) as directory:
                 time.sleep(_DISCOVERY_S)
@@ -122,7 +125,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
             WriterKey(robot.name, stream, writer.session)
             for robot in robots
             for stream, writer in robot.writers
-            if stream in measured_streams
+            if stream in measured_streams and _arrives(sites, robot.name, stream)
         ]
         statistics.wait(measured, _MEASURED_WITHIN_S)
         if as_json:
@@ -131,6 +134,12 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
             print_wrapped(text(robots))
         else:
             print_status(text(robots))
+
+
+def _arrives(sites: Sites, robot: str, stream: StreamName) -> bool:
+    """Whether samples leave the site of the robot; they arrive as well where this process is in that site."""
+    thinning = sites.thinning(robot, stream)
+    return thinning is None or thinning.rate_hz > 0.0
 
 
 def _watch(
@@ -150,8 +159,16 @@ def _watch(
         time.sleep(_JSON_PERIOD_S if as_json else _REFRESH_S)
 
 
-def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, width: int | None = None) -> str:
+def robots_text(
+    robots: Sequence[RobotInfo],
+    statistics: TopicStatistics,
+    sites: Sites | None = None,
+    *,
+    width: int | None = None,
+) -> str:
     """Each robot, and below it each stream: rate, age of the newest sample, writer, start of the writer.
+
+    A robot of a site has a line for that, and "held back" in place of the rates of what does not leave it.
 
     If that is wider than ``width``, first the date is left out, then the columns "since" and "age", then the
     headings; at last writers become letters. Without ``width`` there are no headings.
@@ -164,6 +181,9 @@ def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, wid
     for robot in robots:
         full.append((robot.name, "", "", "", ""))
         undated.append(full[-1])
+        if sites is not None and (place := sites.text_of(robot.name)):
+            full.append(("  site", "", "", place, ""))
+            undated.append(full[-1])
         for stream, writer in robot.writers:
             names = [one for one in robot.names_of(writer, stream) if one != MODEL_WRITER]
             shown = f"  {stream}/{','.join(names)}" if names else f"  {stream}"
@@ -173,6 +193,8 @@ def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, wid
             if source is not None:
                 rate = "silent" if source.is_stale() else rate_text(published_hz)
                 age = format_duration(round(source.silent_s() * 1e9))
+            elif sites is not None and (thinning := sites.thinning(robot.name, stream)):
+                rate = rate or ("" if thinning.rate_hz else "held back")
             start = datetime.fromtimestamp(writer.since // 1_000_000_000).astimezone()
             lasting = _lasting_text(time.time_ns() - writer.since)
             full.append((shown, rate, age, str(writer), f"since {start:%Y-%m-%d %H:%M:%S}, {lasting}"))
@@ -195,22 +217,29 @@ def _lasting_text(nanoseconds: int) -> str:
     return f"{minutes} min {seconds:02d} s" if minutes else format_duration(nanoseconds)
 
 
-def _robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> list[dict[str, Any]]:
+def _robots_facts(
+    robots: Sequence[RobotInfo], statistics: TopicStatistics, sites: Sites
+) -> list[dict[str, Any]]:
     from zstate.net.topic_statistics import WriterKey
 
     def writer_facts(robot: RobotInfo, stream: StreamName, writer: WriterId) -> dict[str, Any]:
         key = WriterKey(robot.name, stream, writer.session)
-        source = statistics.get(key)
+        source, thinning = statistics.get(key), sites.thinning(robot.name, stream)
         return {
             "stream": stream,
             **asdict(writer),
             "names": robot.names_of(writer, stream),
             "rate_hz": statistics.published_hz(key),
             "silent_s": None if source is None else source.silent_s(),
+            "thinned_hz": None if thinning is None else thinning.rate_hz,
         }
 
     return [
-        {"robot": robot.name, "writers": [writer_facts(robot, *pair) for pair in robot.writers]}
+        {
+            "robot": robot.name,
+            "site": sites.site_of(robot.name),
+            "writers": [writer_facts(robot, *pair) for pair in robot.writers],
+        }
         for robot in robots
     ]
 

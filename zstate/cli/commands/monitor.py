@@ -315,6 +315,7 @@ class RobotMonitor(Closeable):
     def __init__(
         self, session: Session, directory: RobotDirectory, robot: str, wire: str, clock: Clock | None
     ) -> None:
+        from zstate.net.sites import NO_SITES, discover_sites
         from zstate.net.status_monitor import StatusMonitor
         from zstate.net.topic_statistics import TopicStatistics
         from zstate.wire.registry import get_wire
@@ -322,6 +323,7 @@ class RobotMonitor(Closeable):
         self._selected = robot
         self._robot = None if robot == ANY else check_robot(robot)
         self._session, self._directory, self._wire, self._clock = session, directory, wire, clock
+        self._sites = NO_SITES if is_ros(wire) else discover_sites(session)
         self._reported = ""
         self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
         self._robots: BoundedDict[str, MonitoredRobot] = BoundedDict()
@@ -408,6 +410,7 @@ class RobotMonitor(Closeable):
             faulty = [status for status in self._statuses.recent(one.robot) if status.level != "ok"]
             if as_json:
                 facts = {"robot": one.robot, **asdict(measure), **self._rate_facts(rates), **asdict(stats)}
+                facts["site"] = self._sites.site_of(one.robot)
                 facts["driver"] = None if driver is None else _driver_facts(driver)
                 print_json({**facts, "faults": list(map(_fault_facts, faulty))})
                 continue
@@ -415,10 +418,13 @@ class RobotMonitor(Closeable):
             for stream, rate_hz in rates.items():
                 rate += f"  {stream} {rate_text(rate_hz) if rate_hz else 'silent'}"
             reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
+            thinning = self._sites.thinning(one.robot, one.follow)
+            is_thinned = thinning is not None and thinning.explains(measure.rate_hz)
+            gaps = "held back on purpose" if is_thinned else "missed"
             print_wrapped(
                 f"{one.robot}  {rate}  "
                 f"age {time_text(measure.age_s)}  latency {time_text(measure.latency_s)}  "
-                f"received {stats.received}  dropped {stats.dropped}  missed {stats.missed}  "
+                f"received {stats.received}  dropped {stats.dropped}  {gaps} {stats.missed}  "
                 f"late {stats.late}  refused {sum(stats.refused.values())}"
                 f"{f' ({reasons})' if reasons else ''}"
                 f"{f'  off the clock {stats.off_clock}' if stats.off_clock else ''}"

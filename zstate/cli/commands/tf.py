@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from threading import Event
@@ -19,6 +20,7 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput, LookupFailed
 
 if TYPE_CHECKING:
+    from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
     from zstate.transform import Transform, Twist
 
@@ -48,6 +50,11 @@ def _parse_stamp(text: str) -> int:
 @click.argument("source", metavar="B")
 @click.option("--once", is_flag=True, help="Print one pose; fail after --timeout with the reason.")
 @click.option("--at", type=options.Checked("STAMP", _parse_stamp), help="Print one pose, at this stamp.")
+@click.option(
+    "--exact",
+    is_flag=True,
+    help="With --once or --at: ask the robot for all its samples, which a router between may thin.",
+)
 @options.timeout_option("How long --once and --at wait [s].")
 @options.seconds_option
 @click.option("--rate", type=options.RATE, default=1.0, help="Maximum rate of printed poses; default: 1.")
@@ -73,6 +80,7 @@ def tf_command(
     source: str,
     once: bool,
     at: int | None,
+    exact: bool,
     timeout: float,
     seconds: float | None,
     rate: float,
@@ -93,6 +101,7 @@ def tf_command(
     zstate tf panda_link0 panda_hand
     zstate tf left/panda_link0 right/panda_hand --once --json
     zstate tf panda_link0 panda_hand --twist --precision 6
+    zstate tf base_link tool0 --at 1795417485.648066880 --exact
     zstate tf base_link tool0 --wire ros2              # reads /tf and /tf_static
     """
     from zstate.cli.waiting import PoseWaiter
@@ -103,6 +112,8 @@ def tf_command(
 
     ends = once or at is not None
     options.check_end(seconds, once=ends)
+    if exact and not ends:
+        raise click.UsageError("--exact asks for one pose: give --at STAMP, or --once")
     with (
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as directory,
@@ -140,7 +151,13 @@ def tf_command(
         if not as_json:
             print_result(f"pose of {source} in {target}")
         if ends:
-            show(waiter.wait(at, timeout_s=timeout))
+            transform = waiter.wait(None if exact else at, timeout_s=timeout)
+            if exact:
+                transform = listener.lookup(target, source, at, exact=True, timeout_s=timeout)
+            show(transform)
+            if not exact and transform.kind == "interpolated" and wire == "native":
+                for text in _thinned(session, listener, transform):
+                    print_status(f"{text}: --exact asks the robot itself")
             return
         shown: Transform | None = None
         deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
@@ -153,6 +170,20 @@ def tf_command(
             elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
                 silent = True
                 print_status(waiter.no_sample_text())
+
+
+def _thinned(session: Session, listener: TransformListener, transform: Transform) -> Iterator[str]:
+    """The robots that move the path of ``transform`` and whose samples arrive thinned, with their sites."""
+    from zstate.net.sites import discover_sites
+
+    frames = listener.buffer.path_frames(transform.target, transform.source)
+    moving = (frame.name for _, frame in frames if frame is not None and frame.kind in ("joint", "pose"))
+    robots = dict.fromkeys(name.partition("/")[0] for name in moving)
+    sites = discover_sites(session)
+    for robot in robots:
+        # At the site itself the samples arrive at their full rate.
+        if (site := sites.site_of(robot)) and listener.stats_of(robot).missed:
+            yield f"site {site!r} thins the samples of {robot!r} on purpose"
 
 
 def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:

@@ -39,6 +39,8 @@ _STATIC_PREFIX = "static edge of"
 def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
     """The checks of the robot of ``probe``, which has collected data for a while."""
     yield _writers_check(probe)
+    if place := probe.sites.text_of(probe.info.name):
+        yield ok("site", place)
     if probe.is_silent and probe.info.writers:
         yield _silent_check(probe, session)
         return
@@ -172,6 +174,8 @@ def _samples_check(probe: RobotProbe) -> Check:
     if window is None and (not writers or "joint_states" not in probe.streams):
         return _no_writer_check(probe)
     writer = str(writers[-1]) if writers else "an unannounced writer"
+    if window is None and (thinning := probe.sites.thinning(robot, stream)) and not thinning.rate_hz:
+        return ok(stream, f"{thinning}")
     if window is None:
         if (status := probe.statuses.get(writers[-1].session)) is not None:
             cause = f"it runs, but {status.text or 'publishes nothing'}"
@@ -197,11 +201,14 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
     status = probe.statuses.get(statistics.session)
     if probe.collector.has_overrun:
         return ok(stream, f"{text}, newest {silence} ago")
+    lost, arrived = stats.missed + stats.dropped, statistics.count
+    thinning = probe.sites.thinning(robot, stream) if lost else None  # none is lost at the site itself
+    if thinning is not None and thinning.explains(rate_hz) and rate_hz >= _MIN_RECEIVED * thinning.rate_hz:
+        return ok(stream, f"{text}, {thinning}, newest {silence} ago")
     if status is not None and rate_hz < _MIN_RECEIVED * status.rate_hz:
         text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost or downsampled on the way"
         return warning(stream, text, hz)
-    lost = stats.missed + stats.dropped
-    if statistics.count < _MIN_RECEIVED * (statistics.count + lost):
+    if arrived < _MIN_RECEIVED * (arrived + lost):
         text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
         return warning(stream, text, f"zstate monitor --robots --robot {robot}")
     return ok(stream, f"{text}, newest {silence} ago")
@@ -237,6 +244,10 @@ def named_writers_checks(
     hz, what = f"zstate hz{probe.argument} --stream {stream}", stream.replace("_", " ")
     for name, writer in names:
         received, known_as = samples.get(writer.session), f"{writer}, as {name!r}" if name else str(writer)
+        thinning = probe.sites.thinning(probe.info.name, stream)
+        if received is None and thinning is not None and not thinning.rate_hz:
+            yield ok(stream, f"{thinning}, of {known_as}")
+            continue
         if received is None:
             stuck = ": it is stopped, or frozen" if writer in probe.unresponsive else ""
             text = f"{known_as}, is announced, but no sample arrives{stuck}"

@@ -25,6 +25,7 @@ from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset, measure_offsets, unanswered
 from zstate.net.presence import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
+from zstate.net.sites import NO_SITES, Sites, discover_sites
 from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
@@ -261,8 +262,8 @@ class RobotProbe:
     ``neighbours`` are all announced robots. ``nodes`` are the samples of each stream by ROS node, on a ROS
     wire; ``transforms`` and ``parts``, the partial joint states, are those of the native wire. ``measured``
     are those of its sensors and its odometry. ``waits`` are the streams without a writer that programs of
-    this robot read, with these programs. ``argument`` is the robot in the commands of findings; empty if the
-    wire is that of one robot.
+    this robot read, with these programs. ``sites`` are those that announce how they thin streams.
+    ``argument`` is the robot in the commands of findings; empty if the wire is that of one robot.
     """
 
     def __init__(
@@ -272,9 +273,10 @@ class RobotProbe:
         neighbours: Sequence[RobotInfo],
         readers: Sequence[Announcement] = (),
         *,
+        sites: Sites = NO_SITES,
         is_only: bool = False,
     ) -> None:
-        self.info, self.neighbours = info, neighbours
+        self.info, self.neighbours, self.sites = info, neighbours, sites
         self.argument = "" if is_only else f" {info.name}"
         self.streams = frozenset(stream for stream, _ in info.writers)
         self.followed: Follow = followed_stream(info, "native" if collector.is_native else "")
@@ -501,10 +503,13 @@ def collected_probes(
     with ExitStack() as opened:
         probes: list[RobotProbe] = []
         readers = discover_readers(session, _READERS_WITHIN_S) if is_native else ()
+        sites = discover_sites(session) if is_native else NO_SITES
         for group in [selected] if is_native else [[info] for info in selected]:
             collector = opened.enter_context(StreamCollector(session, group, wire, waiter.notify))
             is_only = isinstance(messages, RosMessages) and messages.robot is not None
-            probes += [RobotProbe(collector, info, robots, readers, is_only=is_only) for info in group]
+            probes += [
+                RobotProbe(collector, info, robots, readers, sites=sites, is_only=is_only) for info in group
+            ]
         window_end_s = time.monotonic() + min(_MIN_WINDOW_S, timeout_s)
         if is_native:
             offsets: dict[str, list[MeasuredOffset]] = {}

@@ -68,6 +68,8 @@ def _specs(cell: Cell, file: Path, settings: Mapping[str, str]) -> Iterator[tupl
     if cell.router is not None:
         router = cell.router.section
         words = {**router.words, "listen": _router_endpoints(router)}
+        if "site" in words and not words.keys() & {"robot", "robot_file"}:
+            words["robot"] = tuple(word for name in robot_names(cell) for word in ("--robot", name))
         yield _command_spec("router", cell.router, words, ()), cell.router
     first = () if cell.router is None else ("router",)
     for robot in cell.robot:
@@ -198,5 +200,7 @@ def _environment(session: Words, keys: ProcessKeys) -> dict[str, str]:
 
 
 def _router_endpoints(router: CommandTable) -> tuple[str, ...]:
-    default = ROUTER_ENDPOINT if "certs" not in router.words else ROUTER_ENDPOINT.replace("tcp/", "tls/", 1)
+    # The certificates of a site are those of its uplink.
+    is_encrypted = "certs" in router.words and "site" not in router.words
+    default = ROUTER_ENDPOINT.replace("tcp/", "tls/", 1) if is_encrypted else ROUTER_ENDPOINT
     return router.words.get("listen", ("--listen", default))

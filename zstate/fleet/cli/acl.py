@@ -30,6 +30,13 @@ def _role_options(command: Any) -> Any:
 
 @click.command("acl")
 @_role_options
+@click.option(
+    "--site",
+    "sites",
+    multiple=True,
+    metavar="NAME=ROBOT,...",
+    help="The router of a site: forwards what these robots write; may be repeated.",
+)
 @click.option("--namespace", default="", metavar="KEY", help="Zenoh namespace of their sessions, if any.")
 @click.option(
     "--wire",
@@ -41,7 +48,9 @@ def _role_options(command: Any) -> Any:
     envvar="ZSTATE_WIRE",
     help="Their wire format, as in `--wire native --wire 'ros2:domain=5,namespace=*'`; may be repeated.",
 )
-def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, ...]) -> None:
+def acl_command(
+    *, sites: tuple[str, ...], namespace: str, wires: tuple[str, ...], **roles: tuple[str, ...]
+) -> None:
     """Print the access control of a fleet as a router's configuration (JSON5).
 
     Everything that is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`)
@@ -60,14 +69,22 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     \b
     zstate acl --robot r1 --robot r2 --viewer desk >acl.json5
     zstate acl --robot r1 --robot r2 --viewer desk --placer site >acl.json5
+    zstate acl --site plant1=r1,r2 --site plant2=r3 --viewer desk >headquarters.json5
     zstate acl --robot r1 --robot r2 --viewer rviz --wire 'ros2:namespace=*,tf=namespace' >acl.json5
     zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
     """
     from zstate.fleet.acl import AclRoles
     from zstate.fleet.router_config import access_text
 
-    if not any(roles.values()):
+    if not (sites or any(roles.values())):
         *others, last = (f"--{role.replace('_', '-')} NAME" for role in _ROLES)
         raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
-    fleet = AclRoles(**{f"{role}s": roles[role] for role in _ROLES}, namespace=namespace, wires=wires)
+    robots_of: dict[str, tuple[str, ...]] = {}
+    for text in sites:
+        site, _, names = text.partition("=")
+        if not names:
+            raise click.UsageError(f"--site {text!r}: write NAME=ROBOT,..., such as plant1=r1,r2")
+        robots_of[site] = (*robots_of.get(site, ()), *names.split(","))
+    named = {f"{role}s": roles[role] for role in _ROLES}
+    fleet = AclRoles(**named, namespace=namespace, wires=wires, sites=robots_of)
     print_result(access_text(fleet).rstrip("\n"))

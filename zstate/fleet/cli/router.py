@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -15,8 +18,11 @@ from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
+    from zstate.fleet.router_config import Uplink
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.security.credentials import Credentials
+    from zstate.net.session import Session
+    from zstate.streams import StreamName
 
 
 @click.command("router")
@@ -32,15 +38,28 @@ if TYPE_CHECKING:
     "--downsample",
     multiple=True,
     metavar="STREAM=HZ",
-    help="At most HZ samples per second of joint_states, partial_joint_states, tf or transforms to each "
-    "neighbour; may be repeated.",
+    help="At most HZ samples per second of this stream to each neighbour; may be repeated.",
 )
-@click.option("--robot", multiple=True, metavar="NAME", help="Downsample this robot; may be repeated.")
+@click.option("--site", metavar="NAME", help="The router of this site, which thins what leaves on --uplink.")
+@click.option(
+    "--uplink",
+    multiple=True,
+    metavar="ENDPOINT",
+    help="A router of headquarters, for --site; may be repeated.",
+)
+@click.option(
+    "--thin",
+    multiple=True,
+    metavar="STREAM=HZ[,...]",
+    help="Samples per second of each robot that pass on the uplink; of other streams none pass.",
+)
+@click.option("--robot", multiple=True, metavar="NAME", help="Thin this robot; may be repeated.")
+@click.option("--robot-file", type=options.EXISTING_FILE, help="Thin these robots: a name on each line.")
 @click.option(
     "--wan",
     multiple=True,
     metavar="INTERFACE",
-    help="Downsample only on this interface, such as wwan0; may be repeated.",
+    help="Thin only on this interface, such as wwan0; may be repeated.",
 )
 @click.option("--namespace", default="", metavar="KEY", help="Zenoh namespace of the --robot sessions.")
 @click.option("--ros2", is_flag=True, help="Use the settings of rmw_zenohd, to replace it.")
@@ -59,7 +78,11 @@ def router_command(
     connect: tuple[str, ...],
     acl: str | None,
     downsample: tuple[str, ...],
+    site: str | None,
+    uplink: tuple[str, ...],
+    thin: tuple[str, ...],
     robot: tuple[str, ...],
+    robot_file: str | None,
     wan: tuple[str, ...],
     namespace: str,
     ros2: bool,
@@ -75,21 +98,25 @@ def router_command(
     use it with `--connect tcp/HOST:7447`. zenohd accepts the output of `--print`; the password of --user is
     masked there, but not with `--output FILE`.
 
+    With --site, programs of the site have all samples at their full rate, and headquarters has those that
+    --thin names. Latched values, commands, stops and queries pass in any case.
+
     \b
     zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router --acl acl.json5
     zstate router --connect tcp/fleet.example:7447 --downsample joint_states=10 --robot r1 --wan wwan0
+    zstate router --site plant1 --uplink tls/hq.example:7447 --thin joint_states=5 --robot-file r.txt
     zstate router --listen tcp/0.0.0.0:7447 --print >router.json5
     zstate router --ros2                               # for ROS 2 nodes of this host
     zstate router --ros2 --listen "tcp/[::]:7447"      # for all hosts, as rmw_zenohd
     """
     from zstate.fleet.acl import read_access_control
-    from zstate.fleet.router_config import Downsampling, RouterConfig
-    from zstate.net.config import check_credentials, listen_endpoints
+    from zstate.fleet.router_config import Downsampling, RouterConfig, Uplink
+    from zstate.net.config import ROUTER_ENDPOINT, check_credentials, listen_endpoints
 
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
     if file:
-        names = ("ros2", "acl", "downsample", "print", "output")
-        values = (ros2, acl, downsample, only_print, output)
+        names = ("ros2", "acl", "downsample", "site", "print", "output")
+        values = (ros2, acl, downsample, site, only_print, output)
         conflicts = [f"--{name}" for name, value in zip(names, values, strict=True) if value]
         if conflicts:
             raise click.UsageError(
@@ -98,24 +125,28 @@ def router_command(
             )
         _run(SessionOptions("router", connect, listen, config, credentials), listen, metrics, file)
         return
-    downsampling = None
-    if downsample:
-        rates: dict[str, float] = {}
-        for text in downsample:
-            stream, _, rate = text.partition("=")
-            try:
-                rates[stream] = float(rate)
-            except ValueError:
-                raise click.UsageError(
-                    f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10"
-                ) from None
-        downsampling = Downsampling(rates, robot, wan, namespace)
-    elif robot or wan or namespace:
-        raise click.UsageError("--robot, --wan and --namespace need --downsample STREAM=HZ")
+    robots = (*robot, *(_names_in(robot_file) if robot_file else ()))
+    if site is None and (uplink or thin):
+        raise click.UsageError("--uplink and --thin need --site NAME")
+    if site is not None and (downsample or ros2):
+        what = "--downsample" if downsample else "--ros2, whose topics no rule thins,"
+        raise click.UsageError(f"{what} and --site exclude each other; --thin limits what leaves a site")
+    if not (downsample or site is not None) and (robots or wan or namespace):
+        raise click.UsageError(
+            "--robot, --robot-file, --wan and --namespace need --downsample STREAM=HZ, or --site"
+        )
+    link = downsampling = None
+    if site is not None:
+        rates = _rates("--thin", [text for one in thin for text in one.split(",")])
+        link = Uplink(site, uplink, rates, robots, wan, namespace)
+        # Of a site with certificates the uplink is encrypted, and the programs of this host need not be.
+        listen = listen or (ROUTER_ENDPOINT,)
+    elif downsample:
+        downsampling = Downsampling(_rates("--downsample", downsample), robots, wan, namespace)
     endpoints = listen_endpoints("router", listen, credentials)
     check_credentials("router", credentials, endpoints)
     access = read_access_control(acl) if acl else {}
-    router = RouterConfig(endpoints, connect, credentials, downsampling, access, ros2)
+    router = RouterConfig(endpoints, connect, credentials, downsampling, access, ros2, link)
     if only_print:
         print_result(router.text(masked=True).rstrip("\n"))
     if output is not None:
@@ -126,23 +157,73 @@ def router_command(
             fail(f"{output!r} cannot be written: {error.strerror}")
     if not only_print and output is None:
         network = SessionOptions("router", config=router.settings(), credentials=credentials)
-        _run(network, router.listen, metrics)
+        _run(network, router.listen, metrics, uplink=link)
+
+
+def _rates(option: str, texts: Iterable[str]) -> dict[StreamName, float]:
+    """The rates [Hz] in ``texts``, each STREAM=HZ."""
+    rates: dict[str, float] = {}
+    for text in texts:
+        stream, _, rate = text.partition("=")
+        try:
+            rates[stream.strip()] = float(rate)
+        except ValueError:
+            raise click.UsageError(f"{option} {text!r}: write STREAM=HZ, such as joint_states=10") from None
+    return rates
+
+
+def _names_in(path: str) -> list[str]:
+    """The names in a file, one on each line; # begins a comment."""
+    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    return [name for line in lines if (name := line.partition("#")[0].strip())]
 
 
 def _run(
-    network: SessionOptions, listen: tuple[str, ...], metrics: BindAddress | None, file: str = ""
+    network: SessionOptions,
+    listen: tuple[str, ...],
+    metrics: BindAddress | None,
+    file: str = "",
+    uplink: Uplink | None = None,
 ) -> None:
     from zstate.clock import wait_interruptible
     from zstate.net.config import listen_endpoints
+    from zstate.net.sites import SiteAnnouncement
 
+    changed = threading.Event()
     with (
         open_session(network) as session,
-        RobotDirectory(session) as directory,
+        RobotDirectory(session, on_change=changed.set) as directory,
         serve_metrics(metrics, connection_rows(session), writer_rows(directory)),
+        ExitStack() as opening,
     ):
+        if uplink is not None:
+            opening.enter_context(SiteAnnouncement(session, uplink.site, uplink.rates_hz, uplink.robots))
         place = ", ".join(listen) or f"the endpoints in {file!r}"
         print_wrapped(f"router {session.zid} listens at {place}")
         if listen == (default := listen_endpoints("router", (), network.credentials)):
             opened = default[0].replace("127.0.0.1", "0.0.0.0")
             print_status(f"it serves only this host; --listen {opened} opens it to the network")
-        wait_interruptible(threading.Event())
+        if uplink is None:
+            wait_interruptible(threading.Event())
+            return
+        print_wrapped(f"site {uplink.site!r}: {uplink.text}")
+        named: set[str] = set()
+        while True:
+            wait_interruptible(changed)
+            changed.clear()
+            for robot in sorted(_robots_without_rules(session, directory, uplink) - named):
+                named.add(robot)
+                print_status(
+                    f"{robot!r} has no rule: if it is behind this router, all its samples of "
+                    f"{', '.join(uplink.passing)} leave on the uplink; start the router with --robot {robot}"
+                )
+
+
+def _robots_without_rules(session: Session, directory: RobotDirectory, uplink: Uplink) -> set[str]:
+    """The announced robots with a stream that passes on ``uplink``, but for those of all announced sites."""
+    from zstate.net.sites import discover_sites
+
+    passing, ruled = set(uplink.passing), set(uplink.robots)
+    writers = ((one.name, stream) for one in directory.robots() for stream, _ in one.writers)
+    robots = {robot for robot, stream in writers if stream in passing and robot not in ruled}
+    return robots.difference(*discover_sites(session).robots.values()) if robots else robots

@@ -1,0 +1,224 @@
+"""Two routers on loopback: a site's, whose uplink is thinned, and that of headquarters."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from helpers.cli_runner import run_cli
+from helpers.processes import find_free_port, until
+from helpers.robots import RRBOT, UPRIGHT, SampleCollector
+
+from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect
+from zstate.errors import InPast, Unreachable
+from zstate.fleet.router_config import RouterConfig, Uplink
+from zstate.net.session import Session
+from zstate.net.sites import SiteAnnouncement, Thinning, discover_sites
+from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.odometry import ImuPublisher
+
+RATE_HZ = 50.0
+THIN_HZ = 5.0
+
+
+class Site(NamedTuple):
+    """Sessions at a site and at headquarters, and the endpoints of both routers."""
+
+    local: Session
+    far: Session
+    site_endpoint: str
+    headquarters: str
+
+
+@contextmanager
+def running_site(robots: tuple[str, ...], rates_hz: dict[str, float]) -> Iterator[Site]:
+    """The programs of a site use a socket file, so the uplink is told from it by its protocol."""
+    headquarters = f"tcp/127.0.0.1:{find_free_port()}"
+    with ExitStack() as opened:
+        folder = opened.enter_context(tempfile.TemporaryDirectory())
+        site = f"unixsock-stream/{Path(folder) / 'site.sock'}"
+        link = Uplink("plant1", (headquarters,), rates_hz, robots)
+        opened.enter_context(connect(RouterConfig((headquarters,)).settings()))
+        router = opened.enter_context(connect(RouterConfig((site,), uplink=link).settings()))
+        opened.enter_context(SiteAnnouncement(router, link.site, link.rates_hz, robots))
+        local = opened.enter_context(connect(mode="client", endpoints=site))
+        far = opened.enter_context(connect(mode="client", endpoints=headquarters))
+        yield Site(local, far, site, headquarters)
+
+
+@contextmanager
+def published(session: Session, robots: tuple[str, ...], rate_hz: float = RATE_HZ) -> Iterator[None]:
+    """rrbot under each name, moved at ``rate_hz`` by one thread."""
+    stop = threading.Event()
+    with ExitStack() as opened:
+        publishers = [opened.enter_context(StatePublisher(session, RRBOT, name)) for name in robots]
+
+        def run() -> None:
+            begin, tick = time.monotonic(), 0
+            while not stop.wait(max(0.0, begin + tick / rate_hz - time.monotonic())):
+                for number, publisher in enumerate(publishers):
+                    # Far from a straight line between two samples of 5 Hz.
+                    publisher.publish([0.3 * ((tick * 7919 + number) % 11), 0.1 * (tick % 5)])
+                tick += 1
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_headquarters_receives_each_robot_at_the_named_rate_and_the_site_everything():
+    robots = ("r1", "r2")
+    with running_site(robots, {"joint_states": THIN_HZ}) as site, published(site.local, robots):
+        far, near = (
+            {name: SampleCollector(session, f"zstate/{name}/joint_states") for name in robots}
+            for session in (site.far, site.local)
+        )
+        until(lambda: min(len(one.arrivals) for one in far.values()) >= 10, timeout_s=30.0)
+        for name in robots:
+            passed, sent = len(far[name].arrivals), len(near[name].arrivals)
+            # One tick in ten; on a busy machine ticks are late together, and more of them pass.
+            assert sent / passed == pytest.approx(RATE_HZ / THIN_HZ, rel=0.3)
+
+
+def test_of_other_streams_no_sample_passes_while_values_and_queries_do():
+    pose = Transform("odom", "base", (0.0, 0.0, 0.0), UPRIGHT)
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ, "scan": 0.0}) as site,
+        TransformPublisher(site.local, "r1", "odometry") as odometry,
+        StaticPublisher(site.local, "r1", "mount") as mount,
+        TransformListener(site.far, "r1", follow="tf", history_on_join=False) as listener,
+        closing(SampleCollector(site.far, "zstate/r1/transforms/*")) as far,
+        closing(SampleCollector(site.local, "zstate/r1/transforms/*")) as near,
+    ):
+        mount.set(Transform("base", "camera", (0.0, 0.0, 1.0), UPRIGHT))
+        until(lambda: (odometry.publish([pose]), len(near.arrivals) >= 50)[1])
+        assert listener.buffer.wait("base", "camera", timeout_s=10.0).kind == "static"
+        assert not far.arrivals
+        # A reader that joins asks the writer itself.
+        with TransformListener(site.far, "r1", follow="tf") as joined:
+            assert joined.buffer.wait("odom", "base", timeout_s=10.0).kind == "exact"
+
+
+def test_a_lookup_at_headquarters_is_exact_on_demand():
+    """The joints move so that a straight line between samples of 5 Hz is far from them.
+
+    One process publishes several robots.
+    """
+    robots = ("r1", "r2", "r3")
+    with (
+        running_site(robots, {"joint_states": THIN_HZ}) as site,
+        published(site.local, robots),
+        TransformListener(site.local, "r1") as near,
+        TransformListener(site.far, "r1", history_on_join=False) as far,
+    ):
+        until(lambda: far.stats.received >= 4)
+        at = far.buffer.latest("base", "lower") - 133_000_000
+        there = near.buffer.wait("base", "lower", at)
+        assert far.lookup("base", "lower", at).translation != pytest.approx(there.translation, abs=1e-3)
+        assert far.lookup("base", "lower", at, exact=True) == there
+        assert far.buffer.lookup("base", "lower", at) == there
+        # An instant that has not come yet is waited for.
+        soon = near.buffer.latest("base", "lower") + 250_000_000
+        assert far.lookup("base", "lower", soon, exact=True, timeout_s=10.0) == near.buffer.wait(
+            "base", "lower", soon
+        )
+        early = near.buffer.latest("base", "lower") - 9_000_000_000
+        with pytest.raises(InPast, match="all that its writer keeps"):
+            far.lookup("base", "lower", early, exact=True)
+
+
+def test_a_writer_without_a_cache_is_named_by_an_exact_lookup():
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        StatePublisher(site.local, RRBOT, "r1", cache_s=0.0) as publisher,
+        TransformListener(site.far, "r1") as far,
+    ):
+        until(lambda: (publisher.publish([0.1, 0.2]), far.buffer.can_lookup("base", "lower"))[1])
+        with pytest.raises(Unreachable, match=r"which places 'r1/upper', has not sent its samples"):
+            far.lookup("base", "lower", exact=True, timeout_s=0.3)
+
+
+def test_a_site_is_announced_with_its_robots_and_rates():
+    many = tuple(f"robot_{number:04}" for number in range(1000))
+    with connect() as session:
+        with SiteAnnouncement(session, "plant1", {"joint_states": 5.0, "tf": 0.0}, many):
+            sites = discover_sites(session)
+            assert sites.robots == {"plant1": frozenset(many)}
+            assert sites.thinning("robot_0999", "joint_states") == Thinning("plant1", 5.0)
+            assert str(sites.thinning("robot_0000", "tf")) == "held back on purpose by site 'plant1'"
+            assert sites.thinning("robot_0000", "robot_description") is None
+            assert sites.thinning("other", "joint_states") is None
+        assert discover_sites(session).robots == {}
+
+
+def test_tools_at_headquarters_call_no_sample_lost_that_the_site_holds_back():
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        published(site.local, ("r1",)),
+        ImuPublisher(site.local, "r1", "torso", frame="lower") as imu,
+    ):
+        imu.publish((0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+        far, near = ("--connect", site.headquarters), ("--connect", site.site_endpoint)
+        assert "thinned to 5 Hz on purpose by site 'plant1'" in run_cli("hz", "r1", "--once", *far).stdout
+        there = run_cli("hz", "r1", "--once", *near).stdout
+        assert "missed" not in there
+        assert "plant1" not in there
+        monitored = run_cli("monitor", "--robots", "--robot", "r1", "--seconds", "1.5", *far).stdout
+        assert re.search(r"held back on purpose [1-9]", monitored)
+        assert "missed" not in monitored
+        (listed,) = json.loads(run_cli("ls", "--json", *far).stdout)
+        assert listed["site"] == "plant1"
+        thinned = {one["stream"]: one["thinned_hz"] for one in listed["writers"]}
+        assert thinned == {
+            **dict.fromkeys(("tf", "imu"), 0.0),
+            **dict.fromkeys(("tf_static", "robot_description")),
+            "joint_states": 5.0,
+        }
+        text = run_cli("ls", *far).stdout
+        assert "'plant1', from which joint_states at 5 Hz leave" in text
+        assert re.search(r"imu/torso +held back", text)
+        graph = json.loads(run_cli("graph", "--json", *far).stdout)["streams"]
+        rates = {one["stream"]: one["thinned_hz"] for one in graph if one["writers"]}
+        assert (rates["joint_states"], rates["imu/torso"]) == (5.0, 0.0)
+
+
+@pytest.mark.long
+def test_doctor_at_headquarters_names_the_site_and_finds_nothing_wrong():
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        published(site.local, ("r1",)),
+        ImuPublisher(site.local, "r1", "torso", frame="lower") as imu,
+    ):
+        imu.publish((0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+        ended = run_cli("doctor", "r1", "--json", "--connect", site.headquarters)
+        checks = {one["name"]: one for one in json.loads(ended.stdout)["checks"]}
+        assert ended.code == 0, ended
+        assert checks["site"]["text"] == "'plant1', from which joint_states at 5 Hz leave"
+        assert "thinned to 5 Hz on purpose by site 'plant1'" in checks["joint_states"]["text"]
+        assert "held back on purpose by site 'plant1'" in checks["imu"]["text"]
+
+
+def test_tf_exact_asks_the_robot_itself():
+    with running_site(("r1",), {"joint_states": THIN_HZ}) as site, published(site.local, ("r1",)):
+        with TransformListener(site.local, "r1") as near:
+            until(lambda: near.stats.received > 50)
+            at = near.buffer.latest("base", "lower") - 133_000_000
+            there = near.buffer.lookup("base", "lower", at).to_dict()
+        far = ("--at", str(at), "--json", "--connect", site.headquarters)
+        found = json.loads(run_cli("tf", "base", "lower", "--exact", *far).stdout)
+        assert {name: found[name] for name in there} == there
+    ended = run_cli("tf", "base", "lower", "--exact")
+    assert ended.code == 2
+    assert "--exact asks for one pose" in ended.stderr

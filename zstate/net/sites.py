@@ -1,0 +1,116 @@
+"""Sites: routers that thin what leaves on their uplink, and announce it.
+
+A thinned stream has gaps in its sequence numbers that are no losses; tools tell the two apart by the tokens
+of sites.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from typing import NamedTuple
+
+from zstate._util.closeable import Closeable
+from zstate.errors import InvalidInput
+from zstate.net.presence import announce, confirmed_tokens
+from zstate.net.session import Session
+from zstate.plugins import find_stream
+from zstate.streams import StreamName
+from zstate.wire.keys import SITE_TOKEN
+
+_TOKEN_LENGTH = 4000
+"""The length of the names in one token. Keys may be longer, but each router keeps them."""
+
+
+_MOST = 1.25
+"""The largest ratio of a measured to the thinned rate."""
+
+
+class Thinning(NamedTuple):
+    """What the router of ``site`` lets pass of one stream of one robot: ``rate_hz``; nothing if it is 0."""
+
+    site: str
+    rate_hz: float
+
+    def explains(self, rate_hz: float | None) -> bool:
+        """Whether the site makes the gaps in samples that arrive at ``rate_hz``: within it more arrive."""
+        return rate_hz is not None and rate_hz <= _MOST * self.rate_hz
+
+    def __str__(self) -> str:
+        how = f"thinned to {self.rate_hz:g} Hz" if self.rate_hz else "held back"
+        return f"{how} on purpose by site {self.site!r}"
+
+
+class Sites(NamedTuple):
+    """The announced sites: the rates of streams [Hz] and the robots of each, by its name."""
+
+    rates_hz: Mapping[str, Mapping[StreamName, float]]
+    robots: Mapping[str, frozenset[str]]
+
+    def site_of(self, robot: str) -> str | None:
+        """The site that ``robot`` is behind; None if no site announces it."""
+        return next((site for site, robots in self.robots.items() if robot in robots), None)
+
+    def text_of(self, robot: str) -> str:
+        """The site of ``robot``, and what leaves it; empty if no site announces the robot."""
+        site = self.site_of(robot)
+        if site is None:
+            return ""
+        leaving = [f"{stream} at {rate_hz:g} Hz" for stream, rate_hz in self.rates_hz[site].items()]
+        return f"{site!r}, from which {' and '.join(leaving) or 'no sample'} leave"
+
+    def thinning(self, robot: str, stream: StreamName) -> Thinning | None:
+        """How ``stream`` of ``robot`` is thinned; None without a site, or without samples."""
+        site, row = self.site_of(robot), find_stream(stream)
+        if site is None or row is None or not row.is_sampled:
+            return None
+        return Thinning(site, self.rates_hz[site].get(stream, 0.0))
+
+
+NO_SITES = Sites({}, {})
+
+
+class SiteAnnouncement(Closeable):
+    """Announces the site ``name`` with its ``robots`` and the rates at which streams pass, until closed."""
+
+    def __init__(
+        self, session: Session, name: str, rates_hz: Mapping[StreamName, float], robots: Sequence[str]
+    ) -> None:
+        passing = {stream: rate_hz for stream, rate_hz in rates_hz.items() if rate_hz}
+        with ExitStack() as opening:
+            for group in _groups(robots):
+                opening.enter_context(announce(session, SITE_TOKEN.key(name, passing, group)))
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        """Withdraw it. A second call does nothing."""
+        self._opened.close()
+
+
+def _groups(robots: Sequence[str]) -> Iterator[list[str]]:
+    """``robots``, as many together as fit into one token."""
+    group: list[str] = []
+    for robot in robots:
+        if group and sum(map(len, group)) + len(group) + len(robot) > _TOKEN_LENGTH:
+            yield group
+            group = []
+        group.append(robot)
+    if group:
+        yield group
+
+
+def discover_sites(session: Session) -> Sites:
+    """The sites that are announced now. Takes a few milliseconds, and up to a second on a slow link."""
+    return sites_from_tokens(confirmed_tokens(session, SITE_TOKEN.expression()))
+
+
+def sites_from_tokens(tokens: Iterable[str]) -> Sites:
+    """The sites in liveliness ``tokens``; others are left out."""
+    rates_hz: dict[str, dict[StreamName, float]] = {}
+    robots: dict[str, frozenset[str]] = {}
+    for token in sorted(tokens):
+        with suppress(InvalidInput):
+            site, rates, names = SITE_TOKEN.parse(token)
+            rates_hz.setdefault(site, {}).update(rates)
+            robots[site] = robots.get(site, frozenset()) | frozenset(names)
+    return Sites(rates_hz, robots)
