@@ -321,8 +321,9 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
     ):
         shown = show_view(sessions[1], "rrbot")
         clouds = shown.view.scene.clouds
-        until(lambda: "rrbot" in shown.source.models and clouds.has_any)
+        until(lambda: "rrbot" in shown.source.models)
         view_tab = open_tab(shown.page.url)
+        until(lambda: clouds.has_any)
         until_fitted(shown)
         snapshot = shown.source.snapshot()
         placed = snapshot.poses_in("rrbot/world")
