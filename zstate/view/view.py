@@ -172,7 +172,7 @@ class View(Closeable):
                     place = DrawnFrames(snapshot.tree, poses, fixed)
                     self.scene.world.show(self._source.world, self._source.buffer, place, at)
                     self.scene.clouds.show(self._source.world, self._source.buffer, place, at)
-                    self.scene.cameras.show(place)
+                    self.scene.cameras.show(self._source.buffer, place)
                     self.scene.odometry.show(self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
