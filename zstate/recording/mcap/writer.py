@@ -33,6 +33,7 @@ MAX_CHANNELS = 60_000
 GROUP_NS = 10_000_000_000
 """Interval at which latched messages are repeated [ns of log time]."""
 
+_CHUNK_BYTES = 1 << 20
 _MESSAGE_SIZE = 31  # of a message's record, without its payload
 _SEQUENCE = (1 << 32) - 1
 _END_OF_TIME = 1 << 63
@@ -119,7 +120,7 @@ class McapOutput:
         with suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._buffer = _ChunkBuffer(self._file)
-        self.writer = Writer(self._buffer, compression=CompressionType.ZSTD)
+        self.writer = Writer(self._buffer, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self.writer.start(profile, library)
 
     @property
@@ -244,8 +245,13 @@ class SplitFile:
         return True
 
     def add(self, message: RecordedMessage, *, is_repeated: bool = False) -> None:
-        """Write it: into memory, until the chunk is full."""
+        """Write it: into memory, until the chunk is full.
+
+        One that fills a chunk, as a cloud does, has one of its own: readers of other streams skip it.
+        """
         channel, payload, log_time, publish_time, sequence = message
+        if len(payload) >= _CHUNK_BYTES:
+            self.write_chunk()
         number = self._number_of[channel]
         self.output.writer.add_message(number, log_time, payload, publish_time, sequence & _SEQUENCE)
         self._chunk_size += len(payload) + _MESSAGE_SIZE
