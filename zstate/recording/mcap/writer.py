@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, RecordingError
-from zstate.recording.mcap.file import IDENTITY, later_splits, split_path
+from zstate.recording.mcap.file import IDENTITY, MISSING, later_splits, split_path
 from zstate.recording.storage import ChannelType
 from zstate.wire.ros2.qos import Qos
 
@@ -420,6 +420,13 @@ class RecordingWriter(Closeable):
         with self._writing():
             if self._is_open:
                 self._split.write_chunk()
+
+    def state_missing(self, counts: Mapping[str, int]) -> None:
+        """Write how many messages the recorder did not get, by "robot/stream"; once, before it closes."""
+        with self._writing():
+            self._check_open()
+            facts = {name: str(count) for name, count in counts.items()}
+            self._split.output.writer.add_metadata(MISSING, facts)
 
     def close(self) -> None:
         with self._writing():
