@@ -14,7 +14,7 @@ from zstate.errors import InvalidInput, SecondWriter
 
 XYZ = np.array([[1.0, 2.0, 3.0], [np.nan, np.nan, np.nan], [-1.0, 0.5, 0.25]])
 TIMED = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f4")])
-WIRES = ["native", "ros2", "ros2dds"]  # the last has no types in its keys, and finds the topic `cloud` only
+WIRES = ["native", "ros2", "ros2dds"]
 
 
 def received(sessions: Any, wire: str, *args: Any, **options: Any) -> PlacedCloud:
@@ -37,6 +37,18 @@ def test_points_arrive_as_they_were_published(sessions, wire: str):
     assert (placed.stamp, placed.target, placed.sensor) == (5, "r1/lidar", "cloud")
     assert placed.is_rigid
     assert not placed.cloud.is_dense
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_topic_of_any_name_is_read_by_its_name_and_no_other(sessions, wire: str):
+    writer, reader = sessions
+    with (
+        CloudListener(reader, "r1", sensor="velodyne_points", wire=wire) as clouds,
+        CloudPublisher(writer, "r1", "velodyne_points", wire, frame="lidar") as publisher,
+        CloudPublisher(writer, "r1", "cloud", wire, frame="lidar") as other,
+        repeated(lambda: (other.publish(XYZ), publisher.publish(XYZ)), every_s=0.05),
+    ):
+        assert {next(iter(clouds)).sensor for _ in range(3)} == {"velodyne_points"}
 
 
 @pytest.mark.parametrize("wire", WIRES)

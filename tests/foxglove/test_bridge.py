@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,13 @@ import numpy as np
 import pytest
 from helpers.access_routers import join, router_with_users
 from helpers.foxglove_client import FoxgloveClient
-from helpers.processes import until
+from helpers.processes import repeated, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, wait_for_reader, wait_for_stream_readers
 from mcap.reader import make_reader
 
 from zstate.fleet.acl import AclRoles
 from zstate.foxglove.bridge import FoxgloveBridge
-from zstate.foxglove.server import SUBPROTOCOLS, FoxgloveServer
+from zstate.foxglove.server import SUBPROTOCOLS, FoxgloveServer, ServedMessage
 from zstate.net.presence import discover_readers
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener
@@ -101,6 +102,30 @@ def test_decoded_transforms_joints_and_description_are_those_of_lookups(sessions
         client.until(lambda: client.parameters)
         assert client.parameters == {"/robot_description": RRBOT.urdf}
         assert description.data == RRBOT.urdf
+
+
+def test_clouds_give_way_to_other_messages(sessions, serve, monkeypatch: pytest.MonkeyPatch):
+    clouds = pytest.importorskip("zstate.clouds")
+    sent: list[ServedMessage] = []
+    send = FoxgloveServer.send
+
+    def recorded_send(server: FoxgloveServer, messages: Sequence[ServedMessage]) -> None:
+        sent.extend(messages)
+        send(server, messages)
+
+    monkeypatch.setattr(FoxgloveServer, "send", recorded_send)
+    with (
+        StatePublisher(sessions[0], RRBOT, "r1") as publisher,
+        clouds.CloudPublisher(sessions[0], "r1", "top", frame="tool") as lidar,
+        FoxgloveClient(serve("r1").url) as client,
+    ):
+        client.subscribe("/joint_states", "/top")
+        wait_for_stream_readers(sessions[0], "r1", "joint_states", "cloud/top")
+        with repeated(lambda: (publisher.publish(RRBOT.neutral), lidar.publish(np.ones((100, 3))))):
+            client.until(lambda: {"/joint_states", "/top"} <= client.frames.keys())
+        payloads = {payload: topic for topic, frames in client.frames.items() for _, payload in frames}
+    gives_way = {payloads[one.payload]: one.is_bulk for one in sent if one.payload in payloads}
+    assert gives_way == {"/joint_states": False, "/top": True}
 
 
 @pytest.mark.npm

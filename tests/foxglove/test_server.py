@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -113,6 +114,23 @@ def test_the_queue_of_a_client_has_1024_messages_and_32_mib_at_most(
         assert client.dropped == 0
         client.put(ServedMessage(TF.number, b"1", kept))
         assert client.dropped == 1
+
+
+def test_states_are_sent_before_clouds_and_no_cloud_drops_one(server: FoxgloveServer):
+    with connect(server.url, subprotocols=["foxglove.sdk.v1"]) as websocket:
+        client = _Client(websocket)  # of which nothing is sent
+        client.subscriptions = {TF.number: 7, TEXT.number: 8}
+        for stamp in range(1024):
+            client.put(ServedMessage(TEXT.number, bytes(2**16), stamp, is_bulk=True))
+            client.put(ServedMessage(TF.number, b"pose", stamp))
+        kept = 2**25 // 2**16
+        assert client.dropped == 1024 - kept
+        sent = [client._next_frame() for _ in range(2048)]
+    found = [struct.unpack_from("<BIQ", frame)[1:] for frame in sent if isinstance(frame, bytes)]
+    assert found == [
+        *((7, stamp) for stamp in range(1024)),
+        *((8, stamp) for stamp in range(1024 - kept, 1024)),
+    ]
 
 
 def test_a_cloud_that_is_larger_than_the_queue_is_sent(server: FoxgloveServer):

@@ -342,6 +342,7 @@ def test_missed_undecodable_and_unwritable_messages_are_counted(sessions, tmp_pa
     assert stats.refused == {"no stamp": 1, "stamp outside 1901 to 2038": 1, "malformed": 1, "foreign": 1}
     with RecordingReader(tmp_path / "run.mcap") as recording:
         assert [record.sequence for record in recording.records()] == [7, 8, 12, 15]
+        assert recording.missing == {"r1/joint_states": 3}
 
 
 def test_simulated_time_is_recorded_with_the_robots(sessions, tmp_path: Path):

@@ -18,6 +18,8 @@ pytest.importorskip("viser")
 from zstate import StatePublisher, StaticPublisher, Transform, load_model
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses
+from zstate.clouds import CloudPublisher
+from zstate.net.streams import KeyPublisher
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.camera import Camera, Visibility, fit_camera
 from zstate.view.data_source import ViewSource
@@ -77,6 +79,30 @@ def test_drawing_error_is_logged_once_shown_on_the_page_and_retried(page, caplog
     (logged,) = [record.getMessage() for record in caplog.records]
     assert "failed to draw a picture (ValueError: try number" in logged
     assert "test_view.py, line" in logged
+
+
+def test_clouds_and_pictures_are_received_while_a_browser_shows_the_page(page, sessions):
+    keys = [f"zstate/r1/{stream}" for stream in ("cloud/top", "image/wrist")]
+    points = np.ones((5, 3))
+    with (
+        ViewSource(sessions[1]) as source,
+        View(source, page) as view,
+        CloudPublisher(sessions[0], "r1", "top", frame="lidar") as lidar,
+        ExitStack() as opened,
+    ):
+        bulk = [opened.enter_context(KeyPublisher(sessions[0], key, "")) for key in keys]
+        scans = opened.enter_context(KeyPublisher(sessions[0], "zstate/r1/scan/front", ""))
+        view.draw()
+        until(lambda: scans.has_readers)
+        assert [one.has_readers for one in bulk] == [False, False]
+        with drawing(view, page):
+            until(lambda: all(one.has_readers for one in bulk))
+            until(lambda: lidar.publish(points) or source.world.clouds)
+            page.connected.clear()  # the last browser has left
+            until(lambda: not any(one.has_readers for one in bulk))
+            until(lambda: not source.world.clouds)
+            page.connected.set()
+            until(lambda: lidar.publish(points) or source.world.clouds)
 
 
 @pytest.mark.long

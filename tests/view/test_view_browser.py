@@ -321,8 +321,9 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
     ):
         shown = show_view(sessions[1], "rrbot")
         clouds = shown.view.scene.clouds
-        until(lambda: "rrbot" in shown.source.models and clouds.has_any)
+        until(lambda: "rrbot" in shown.source.models)
         view_tab = open_tab(shown.page.url)
+        until(lambda: clouds.has_any)
         until_fitted(shown)
         snapshot = shown.source.snapshot()
         placed = snapshot.poses_in("rrbot/world")
@@ -355,13 +356,14 @@ def test_picture_is_shown_in_the_tab_and_on_the_frustum(open_tab, show_view, ses
     ):
         mount.set(Transform("world", "lens", (0.0, 3.0, 1.0), turn))
         shown = show_view(sessions[1], "rrbot")
-        until(lambda: "rrbot" in shown.source.models and shown.view.scene.cameras.shown)
+        until(lambda: "rrbot" in shown.source.models)
         view_tab = open_tab(shown.page.url)
+        until(lambda: shown.view.scene.cameras.shown)
         until_fitted(shown)
-        height, width = shape_of(view_tab)
 
         def red_parts() -> tuple[bool, bool]:
             """Whether there is red in the scene, and in the panels."""
+            height, width = shape_of(view_tab)
             pixels = view_tab.pixels().astype(int)
             is_red = (pixels[:, :, 0] > 150) & (pixels[:, :, 1:].max(axis=2) < 60)
             return is_red[:height, : width - 20].sum() > 200, is_red[:, width:].sum() > 2000
@@ -373,6 +375,7 @@ def test_picture_is_shown_in_the_tab_and_on_the_frustum(open_tab, show_view, ses
 
         # The outline of the arm, which the camera sees, is green.
         def has_green() -> bool:
+            _, width = shape_of(view_tab)
             red, green, blue = np.moveaxis(view_tab.pixels().astype(int)[150:, width:], -1, 0)
             return (green - np.maximum(red, blue) > 40).sum() > 30
 

@@ -65,16 +65,22 @@ class VideoDecoder:
         self.form: PictureFormat = form
         self._av = pyav()
         self._decoder: Any = None
+        self._next: tuple[int, int] | None = None
 
     def skip(self) -> None:
         """Wait for the next key frame: a packet is lost."""
         self._decoder = None
 
-    def decode(self, packet: bytes) -> Pixels:
+    def decode(self, packet: bytes, number: tuple[int, int] | None = None) -> Pixels:
         """The pixels of the next packet: RGB (H, W, 3).
 
-        Raises MessageError with the reason "no key frame" if it waits for one, or "broken".
+        ``number`` is the session of its writer, and the number in it: a gap is a loss. Raises MessageError
+        with the reason "no key frame" if it waits for one, or "broken".
         """
+        if number is not None:
+            if number != self._next:
+                self.skip()
+            self._next = number[0], number[1] + 1
         if self._decoder is None:
             if not is_key_frame(packet, self.form):
                 text = f"a packet of {self.form} before the first key frame, or after a loss"

@@ -92,7 +92,7 @@ class CameraListener(Closeable):
         self._refusals = Refusals("picture")
         self.refused: dict[str, int] = self._refusals.counts
         self._clock: Clock = clock or SystemClock()
-        self._videos: dict[str, _Video] = {}
+        self._videos: dict[str, VideoDecoder] = {}
         self._lock = fork_safe_lock()
         self._unread: set[str] = set()
         self._arrived: Inbox[str] = Inbox(_MAX_CAMERAS, session.check)
@@ -160,7 +160,7 @@ class CameraListener(Closeable):
             return
         self.outdated.update({name} & self.pictures.keys())
         if name in self._videos:
-            self._videos[name].decoder.skip()
+            self._videos[name].skip()
 
     def _on_pictures(self, received: list[Received]) -> None:
         for robot, key, message in received:
@@ -188,11 +188,11 @@ class CameraListener(Closeable):
 
     def _decoded(self, name: str, message: CompressedImage) -> Pixels:
         video = self._videos.get(name)
-        if video is None or video.decoder.form != message.format:
+        if video is None or video.form != message.format:
             if len(self._videos) >= _MAX_CAMERAS:
                 raise InvalidInput(f"the robot {self.robot!r} has more than {_MAX_CAMERAS} videos")
-            video = self._videos[name] = _Video(VideoDecoder(message.format))
-        return video.decode(message)
+            video = self._videos[name] = VideoDecoder(message.format)
+        return video.decode(message.data, (message.session, message.seq))
 
     def _add(self, picture: Picture) -> None:
         name = picture.name
@@ -223,21 +223,6 @@ class CameraListener(Closeable):
         """Stop listening; iterations end. A second call does nothing."""
         self._opened.close()
         self._arrived.close()
-
-
-@dataclass
-class _Video:
-    """The decoder of one camera's video, and its last packet."""
-
-    decoder: VideoDecoder
-    session: int = 0
-    seq: int = -1
-
-    def decode(self, message: CompressedImage) -> Pixels:
-        if (message.session, message.seq) != (self.session, self.seq + 1):
-            self.decoder.skip()
-        self.session, self.seq = message.session, message.seq
-        return self.decoder.decode(message.data)
 
 
 def _reason(error: Exception) -> str:

@@ -69,9 +69,10 @@ class CloudListener(PlacingListener[Cloud, PlacedCloud]):
     oldest are lost; ``dropped["Overflow"]`` counts them. ``refused`` counts messages that are no cloud, by
     reason; the first of each reason is also logged.
 
-    ``sensor`` selects one sensor of the robot, on the native wire; "*": all of them. Frames come from
-    ``buffer``; without one, the listener fills a buffer of its own with the transforms of the robot. Bare
-    frame names are the robot's own. A context manager.
+    ``sensor`` selects one sensor of the robot; "*": all of them. On the wire "ros2dds", whose keys have no
+    types, "*" is that of the topic ``cloud``. Frames come from ``buffer``; without one, the listener fills a
+    buffer of its own with the transforms of the robot. Bare frame names are the robot's own. A context
+    manager.
     """
 
     def __init__(

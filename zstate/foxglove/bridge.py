@@ -16,7 +16,7 @@ from zstate.foxglove.server import FoxgloveServer, ServedChannel, ServedMessage
 from zstate.ingest.counters import Counters
 from zstate.net.presence import LivelinessToken, WriterWatch, announce_reader
 from zstate.net.session import Session
-from zstate.plugins import is_latched
+from zstate.plugins import is_bulk, is_latched
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.recorder import MessageQueue, SampleRecorder, recorded_streams
@@ -55,14 +55,17 @@ class ServedTopics:
         self._users: defaultdict[int, set[object]] = defaultdict(set)
         self._of_robot: defaultdict[str, set[int]] = defaultdict(set)
         self._latched: set[tuple[ChannelId, str]] = set()
+        self._bulk: set[int] = set()
         self._waiting: list[ServedMessage] = []
 
-    def open(self, topic: str, type: ChannelType, user: object) -> ChannelId:
+    def open(self, topic: str, type: ChannelType, user: object, *, is_bulk: bool = False) -> ChannelId:
         """The channel of a topic, advertised until each ``user`` has closed it."""
         key = topic, type.name
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = ServedChannel(len(self._channels) + 1, topic, type)
+        if is_bulk:
+            self._bulk.add(channel.number)
         users = self._users[channel.number]
         if not users:
             self._server.advertise(channel)
@@ -116,7 +119,7 @@ class ServedTopics:
     def write(
         self, channel: ChannelId, payload: bytes, log_time: int, publish_time: int, *, sequence: int = 0
     ) -> None:
-        self._waiting.append(ServedMessage(channel, payload, log_time))
+        self._waiting.append(ServedMessage(channel, payload, log_time, is_bulk=channel in self._bulk))
 
     def latch(
         self,
@@ -267,7 +270,7 @@ class FoxgloveBridge(Closeable):
                     self._on_event(f"robot {robot!r} is served")
                 writers.add(announced)
                 self._feeds_of[announced] = [
-                    (self._topics.open(topic, kind, announced), feed)
+                    (self._topics.open(topic, kind, announced, is_bulk=is_bulk(feed[1])), feed)
                     for topic, kind, feed in self._topics_of(encoder, announced)
                 ]
             elif not alive and announced in writers:

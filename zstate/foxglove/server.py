@@ -35,6 +35,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from zstate._util.bounded import BoundedQueue
 from zstate._util.closeable import Closeable
 from zstate.errors import printable
 from zstate.recording.storage import ChannelType
@@ -47,9 +48,9 @@ ORIGINS = ("https://app.foxglove.dev", "file://")
 """Foxglove in a browser, and desktop programs made with Electron; browsers send "null" for files."""
 
 BACKLOG = 1024
-"""Messages that wait for one client; the oldest are dropped beyond it."""
+"""Messages that wait for one client; the oldest are dropped beyond it. Bulk data has a queue of its own."""
 BACKLOG_BYTES = 1 << 25
-"""Limit of their bytes, if that is reached first; a cloud that is larger waits alone."""
+"""Limit of the bytes of each of the two, if that is reached first; a cloud that is larger waits alone."""
 
 _MESSAGE = struct.Struct("<BIQ")
 _TIME = struct.Struct("<BQ")
@@ -94,13 +95,15 @@ class ServedChannel(NamedTuple):
 class ServedMessage(NamedTuple):
     """A message of the channel ``number``, received at ``stamp`` [ns].
 
-    With a ``key`` it is latched: later subscribers receive it, until the next one of the same key.
+    With a ``key`` it is latched: later subscribers receive it, until the next one of the same key. Bulk data
+    (``Stream.bulk``) gives way to the others.
     """
 
     number: int
     payload: bytes
     stamp: int
     key: str = ""
+    is_bulk: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +123,10 @@ class FoxgloveServer(Closeable):
     ``on_readers()`` is called after a client has subscribed or unsubscribed, ``on_event(text)`` for clients
     that come, leave or are refused; both from the thread of the server.
 
-    There are 64 clients at most. Each has a queue of its own: a client that reads slowly loses its oldest
-    messages, which are counted, and delays no other. It always receives the newest latched message of each
-    key. A client that does not answer a ping within 20 s is disconnected.
+    There are 64 clients at most. Each has queues of its own: a client that reads slowly loses its oldest
+    messages, which are counted, and delays no other. Clouds and pictures are sent when nothing else waits,
+    and are lost before states are. It always receives the newest latched message of each key. A client that
+    does not answer a ping within 20 s is disconnected.
 
     Raises InvalidInput if ``host`` or ``port`` cannot be used.
     """
@@ -197,7 +201,7 @@ class FoxgloveServer(Closeable):
         self._call(remove)
 
     def send(self, messages: Sequence[ServedMessage]) -> None:
-        """Send messages to the clients that have subscribed to their channels, in this order."""
+        """Send messages to the clients that have subscribed to their channels: bulk data last."""
 
         def put() -> None:
             for message in messages:
@@ -406,8 +410,8 @@ class _Client:
         self._connection = connection
         self._controls: deque[str] = deque()
         self._latched: OrderedDict[tuple[int, str], ServedMessage] = OrderedDict()
-        self._samples: deque[ServedMessage] = deque()
-        self._bytes = 0
+        self._samples = BoundedQueue[ServedMessage](BACKLOG, BACKLOG_BYTES)
+        self._bulk = BoundedQueue[ServedMessage](BACKLOG, BACKLOG_BYTES)
         self._time: int | None = None
         self._warned_at = 0.0
         self._has_work = asyncio.Event()
@@ -431,11 +435,9 @@ class _Client:
         if message.key:
             self._latched[message.number, message.key] = message
         else:
-            self._samples.append(message)
-            self._bytes += len(message.payload)
-            while len(self._samples) > 1 and (len(self._samples) > BACKLOG or self._bytes > BACKLOG_BYTES):
-                self._bytes -= len(self._samples.popleft().payload)
-                self.dropped += 1
+            queue = self._bulk if message.is_bulk else self._samples
+            if lost := queue.append(message, min(len(message.payload), BACKLOG_BYTES)):
+                self.dropped += lost
                 self._warn()
         self._has_work.set()
 
@@ -462,12 +464,11 @@ class _Client:
         if self._time is not None:
             stamp, self._time = self._time, None
             return _TIME.pack(2, stamp)
-        while self._latched or self._samples:
+        while self._latched or self._samples or self._bulk:
             if self._latched:
                 _, message = self._latched.popitem(last=False)
             else:
-                message = self._samples.popleft()
-                self._bytes -= len(message.payload)
+                message = (self._samples or self._bulk).popleft()
             subscription = self.subscriptions.get(message.number)
             if subscription is not None:
                 self.sent += 1

@@ -134,7 +134,15 @@ class PlacingListener(Closeable, Generic[M, P]):
             self._buffer = buffer
             on_error = self._refusals.count
             opening.enter_context(
-                subscribe(session, self._wire, robot, stream, self._on_messages, on_error=on_error)
+                subscribe(
+                    session,
+                    self._wire,
+                    robot,
+                    stream,
+                    self._on_messages,
+                    name=self.sensor,
+                    on_error=on_error,
+                )
             )
             for announcement in announce_reader(session, self._wire, robot, (stream,)):
                 opening.enter_context(announcement)
@@ -156,8 +164,6 @@ class PlacingListener(Closeable, Generic[M, P]):
         deadline = time.monotonic() + self._timeout_s
         for robot, key, message in received:
             sensor = self._wire.edge_writer_name(key) or self._stream
-            if self.sensor not in (ANY, sensor):
-                continue
             try:
                 lost = self._queue_of(sensor).add(self._read(message, robot), deadline)
             except InvalidInput as error:

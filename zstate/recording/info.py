@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ class RecordingInfo:
     """Summary of a recording. ``size`` is in bytes; ``first`` and ``last`` are log times [ns].
 
     ``profiles``, ``libraries`` and ``compressions`` of its files and the ``robots`` named by its channels are
-    without duplicates. ``skipped``, ``complete`` and ``losses`` are those of RecordingReader.
+    without duplicates. ``skipped``, ``complete``, ``losses`` and ``missing`` are those of RecordingReader.
     """
 
     path: Path
@@ -41,6 +41,7 @@ class RecordingInfo:
     compressions: tuple[str, ...]
     complete: bool
     losses: tuple[str, ...]
+    missing: Mapping[str, int]
     first: int | None
     last: int | None
     channels: tuple[Channel, ...]
@@ -77,6 +78,7 @@ def read_info(path: str | os.PathLike[str]) -> RecordingInfo:
             compressions=_unique(word for file in files for word in file.compressions),
             complete=reader.complete,
             losses=reader.losses,
+            missing=reader.missing,
             first=first,
             last=last,
             channels=reader.channels(),

@@ -9,10 +9,11 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Any
 from urllib.parse import quote
 
@@ -56,6 +57,7 @@ class RecordingReader(Closeable):
 
     A truncated or damaged file is read as far as possible: ``complete`` is then False, and ``losses``
     describes what is missing. Damage that is found only during a read raises RecordingError there.
+    ``missing`` are the messages that the recorder did not get, by "robot/stream", if it has stated them.
     ``skipped`` are the channels that are not readable (see ``Channel``); their records are left out.
     """
 
@@ -77,6 +79,7 @@ class RecordingReader(Closeable):
             *(f"{storage.path.name}: {loss}" for storage in self.storages for loss in storage.losses),
             *(f"{name} is missing" for name in missing),
         )
+        self.missing = {name: count for one in self.storages for name, count in one.missing.items()}
         self.complete = not self.losses and all(storage.complete for storage in self.storages)
 
     def channels(self) -> tuple[Channel, ...]:
@@ -131,6 +134,7 @@ class SqliteFile:
     complete = True
     compressions: tuple[str, ...] = ()
     losses: tuple[str, ...] = ()
+    missing: Mapping[str, int] = MappingProxyType({})
 
     def __init__(self, path: Path) -> None:
         self.path = path

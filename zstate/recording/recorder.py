@@ -374,6 +374,8 @@ class Recorder(Closeable):
                 raise self._large.failure
         self._write_pending()
         self._large.finish(self._ends_at)
+        if missing := self._samples.missing:
+            self._writer.state_missing({"/".join(source): count for source, count in missing.items()})
         self._writer.close()
 
     def _write_pending(self) -> None:

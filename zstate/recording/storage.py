@@ -115,7 +115,8 @@ class Storage(Protocol):
 
     ``channels`` are all of its channels, with any encoding; ``span`` its first and last log time; ``profile``
     and ``library`` the writer's own description. ``complete`` is True if the writer closed the file and
-    nothing is lost; ``losses`` describes what is.
+    nothing is lost; ``losses`` describes what is. ``missing`` are the messages that a recorder of zstate did
+    not get, by "robot/stream".
     """
 
     path: Path
@@ -128,6 +129,7 @@ class Storage(Protocol):
     compressions: tuple[str, ...]
     complete: bool
     losses: tuple[str, ...]
+    missing: Mapping[str, int]
 
     def parts(self, read_filter: ReadFilter) -> Sequence[SortedPart]:
         """The selected records of readable channels."""

@@ -64,10 +64,10 @@ class ScanListener(PlacingListener[Scan, PlacedScan]):
     256 scans or 16 MiB of one sensor wait, the oldest are lost; ``dropped["Overflow"]`` counts them.
     ``refused`` counts messages that are no scan, by reason; the first of each reason is also logged.
 
-    ``sensor`` selects one scanner of the robot, on the native wire; "*": all of them. Frames come from
-    ``buffer``; without one, the listener fills a buffer of its own with the transforms of the robot. Bare
-    frame names are the robot's own. ``clock`` is that of the buffer of its own; default: the system's. A
-    context manager.
+    ``sensor`` selects one scanner of the robot; "*": all of them. On the wire "ros2dds", whose keys have no
+    types, "*" is that of the topic ``scan``. Frames come from ``buffer``; without one, the listener fills a
+    buffer of its own with the transforms of the robot. Bare frame names are the robot's own. ``clock`` is
+    that of the buffer of its own; default: the system's. A context manager.
     """
 
     def __init__(

@@ -206,6 +206,7 @@ def view_command(
                 fixed_frame=fixed_frame,
                 camera=camera,
                 aspect=size[0] / size[1] if snapshot else 1.0,
+                receives_always=snapshot is not None,  # its browser is there for one picture
             )
         )
         stop = threading.Event()

@@ -120,9 +120,5 @@ class PictureReader:
     def _decode(self, packet: Packet) -> Pixels:
         if self._decoder is None or self._decoder.form != packet.format:
             self._decoder = VideoDecoder(packet.format)
-            self._decoded = None
-        session, number = packet.number
-        if self._decoded is None or (session, number - 1) != self._decoded.number:
-            self._decoder.skip()
         self._decoded = packet
-        return self._decoder.decode(packet.data)
+        return self._decoder.decode(packet.data, packet.number)

@@ -262,6 +262,9 @@ class RecordedWorld(Closeable):
             self.clouds[name].read_again()
         self._cloud_limits[name] = points
 
+    def receive_bulk(self, *, on: bool) -> None:
+        """Does nothing: clouds and pictures are read from the file when they are drawn."""
+
     def _add_picture(self, decoded: DecodedMessage) -> None:
         assert isinstance(decoded.message, CompressedImage)
         name = _name(decoded)

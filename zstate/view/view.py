@@ -59,7 +59,8 @@ class View(Closeable):
     ``folders`` maps the text of each URDF file that the user named to its folder: a robot with such a URDF
     is drawn with every file that it names, other robots with files in packages only.
     ``fixed_frame`` and ``camera`` are the initial ones; the default camera shows all robots, in a picture
-    that is ``aspect`` times as wide as high. One thread calls ``run`` or ``draw``; ``hold`` and
+    that is ``aspect`` times as wide as high. Clouds, and pictures of cameras, are received while a browser
+    shows the page, or always with ``receives_always``. One thread calls ``run`` or ``draw``; ``hold`` and
     ``visibility`` are for another.
     """
 
@@ -75,6 +76,7 @@ class View(Closeable):
         fixed_frame: str = "",
         camera: Camera | None = None,
         aspect: float = 1.0,
+        receives_always: bool = False,
     ) -> None:
         self._source = source
         self._page = page
@@ -84,6 +86,7 @@ class View(Closeable):
         self.layout = PanelLayout(page, source, self.scene, sliders, fixed_frame, can_command=can_command)
         self._camera = camera
         self._aspect = aspect
+        self._receives_always = receives_always
         self._version = -1
         self._drawn: dict[str, RobotModel] = {}
         self._fitted_to: tuple[str, tuple[tuple[str, ...], tuple[str, ...]], int, int] | None = None
@@ -118,14 +121,17 @@ class View(Closeable):
 
     def run(self, stop: threading.Event) -> None:
         """Draw until ``stop`` is set. If drawing raises, the error is logged and shown on the page."""
+        is_shown = False
         while not stop.is_set():
-            if not self._page.connected.wait(_IDLE_S):
+            self._source.world.receive_bulk(on=is_shown or self._receives_always)
+            if is_shown:
+                for _ in Rate(self._rate_hz, SystemClock(), stop):
+                    self._try_to_draw()
+                    if not self._page.connected.is_set():
+                        break
+            else:
                 self._try_to_draw()  # so that the next browser finds everything
-                continue
-            for _ in Rate(self._rate_hz, SystemClock(), stop):
-                self._try_to_draw()
-                if not self._page.connected.is_set():
-                    break
+            is_shown = self._page.connected.wait(_IDLE_S)  # a page that is reloaded is away for less
 
     def _try_to_draw(self) -> None:
         """Draw, or show the error on the page and log it once for each line of code that raises it."""
@@ -166,7 +172,7 @@ class View(Closeable):
                     place = DrawnFrames(snapshot.tree, poses, fixed)
                     self.scene.world.show(self._source.world, self._source.buffer, place, at)
                     self.scene.clouds.show(self._source.world, self._source.buffer, place, at)
-                    self.scene.cameras.show(place)
+                    self.scene.cameras.show(self._source.buffer, place)
                     self.scene.odometry.show(self._source.buffer, place, at)
                     self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:

@@ -31,6 +31,7 @@ from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.scans.plugin import MAP, SCAN
 from zstate.scans.scan import Scan, scan_from_message
+from zstate.streams import StreamName
 from zstate.view.pictures import Packet, packet_from_message
 from zstate.view.thinned_cloud import ThinnedCloud, thinned_cloud
 from zstate.wire.keys import ANY, shortened
@@ -61,7 +62,9 @@ _FURTHER = {
     _TOO_MANY_CAMERAS: "pictures of further cameras",
     _TOO_MANY_MAPS: "further maps",
 }
-WORLD_STREAMS = SCAN.name, CLOUD.name, IMAGE.name, CAMERA_INFO.name, MAP.name
+_ALWAYS = SCAN.name, CAMERA_INFO.name, MAP.name
+_BULK = CLOUD.name, IMAGE.name
+WORLD_STREAMS = *_ALWAYS, *_BULK
 """What surrounds robots."""
 
 TIME_JUMP_NS = 1_000_000_000
@@ -159,6 +162,10 @@ class WorldData(Protocol):
 
     def maps_at(self, at: int | None) -> Mapping[WriterName, Grid]:
         """The map of each writer ``at`` a stamp [ns]; None: the newest."""
+        ...
+
+    def receive_bulk(self, *, on: bool) -> None:
+        """Receive clouds and pictures, or end that. They come from a network only if it is on."""
         ...
 
     def close(self) -> None: ...
@@ -288,10 +295,11 @@ class _SensorTable(dict[WriterName, LiveSensor[M]]):
 class WorldSource(Closeable):
     """Receives the scans, clouds and pictures of all robots, or of ``robots`` only, and all maps.
 
-    Without a ``session`` it receives nothing. ``maps``, ``sensors``, ``clouds`` and ``pictures`` are by the
-    names of their writers; a map that is withdrawn is removed from ``maps``, and the longest stale sensor
-    when there are more than 64. ``refused`` counts messages that are none of these, or for which there is no
-    room, by reason; the first of each is logged.
+    Clouds and pictures, up to 60 MB each, are received while ``receive_bulk`` is on; those that were kept
+    are dropped when it ends. Without a ``session`` it receives nothing. ``maps``, ``sensors``, ``clouds`` and
+    ``pictures`` are by the names of their writers; a map that is withdrawn is removed from ``maps``, and the
+    longest stale sensor when there are more than 64. ``refused`` counts messages that are none of these, or
+    for which there is no room, by reason; the first of each is logged.
     """
 
     def __init__(
@@ -314,41 +322,65 @@ class WorldSource(Closeable):
         self._maps: dict[str, tuple[WriterName, Grid]] = {}
         self._refusals = Refusals()
         self.refused: Mapping[str, int] = self._refusals.counts
+        self._session = session
+        self._robot = robots[0] if len(robots) == 1 else ANY
+        self._bulk = ExitStack()
+        """The subscriptions to clouds and pictures."""
+        self._is_receiving_bulk = self._is_closed = False
+        self._bulk_lock = fork_safe_lock()
         with ExitStack() as opening:
             if session is not None:
-                robot = robots[0] if len(robots) == 1 else ANY
-                count = self._refusals.count
-                scans = subscribe(session, self._wire, robot, SCAN.name, self._on_scans, on_error=count)
-                opening.enter_context(scans)
-                clouds = subscribe(session, self._wire, robot, CLOUD.name, self._on_clouds, on_error=count)
-                opening.enter_context(clouds)
-                pictures = subscribe(
-                    session, self._wire, robot, IMAGE.name, self._on_pictures, on_error=count
+                self._subscribe(opening, session, SCAN.name, self._on_scans)
+                self._subscribe(
+                    opening, session, CAMERA_INFO.name, self._on_cameras, self._on_camera_withdrawn
                 )
-                opening.enter_context(pictures)
-                cameras = subscribe(
-                    session,
-                    self._wire,
-                    robot,
-                    CAMERA_INFO.name,
-                    self._on_cameras,
-                    on_error=count,
-                    on_withdrawn=self._on_camera_withdrawn,
-                )
-                opening.enter_context(cameras)
-                maps = subscribe(
-                    session,
-                    self._wire,
-                    ANY,
-                    MAP.name,
-                    self._on_maps,
-                    on_error=count,
-                    on_withdrawn=self._on_withdrawn,
-                )
-                opening.enter_context(maps)
-                for announcement in announce_reader(session, self._wire, robot, WORLD_STREAMS):
-                    opening.enter_context(announcement)
+                # Maps of other robots, too, are drawn around the selected ones.
+                self._subscribe(opening, session, MAP.name, self._on_maps, self._on_withdrawn, robot=ANY)
+                self._announce(opening, session, _ALWAYS)
             self._opened = opening.pop_all()
+
+    def _subscribe(
+        self,
+        opening: ExitStack,
+        session: Session,
+        stream: StreamName,
+        on_messages: Callable[[list[Received]], object],
+        on_withdrawn: Callable[[str], object] | None = None,
+        *,
+        robot: str = "",
+    ) -> None:
+        subscription = subscribe(
+            session,
+            self._wire,
+            robot or self._robot,
+            stream,
+            on_messages,
+            on_error=self._refusals.count,
+            on_withdrawn=on_withdrawn,
+        )
+        opening.enter_context(subscription)
+
+    def _announce(self, opening: ExitStack, session: Session, streams: Sequence[StreamName]) -> None:
+        for announcement in announce_reader(session, self._wire, self._robot, streams):
+            opening.enter_context(announcement)
+
+    def receive_bulk(self, *, on: bool) -> None:
+        """Subscribe to clouds and pictures, or end that. Nothing is done a second time, nor once closed."""
+        with self._bulk_lock:
+            if self._session is None or on == self._is_receiving_bulk or self._is_closed:
+                return
+            if on:
+                with ExitStack() as opening:
+                    self._subscribe(opening, self._session, CLOUD.name, self._on_clouds)
+                    self._subscribe(opening, self._session, IMAGE.name, self._on_pictures)
+                    self._announce(opening, self._session, _BULK)
+                    self._bulk = opening.pop_all()
+            else:
+                self._bulk.close()
+                with self._lock:
+                    self._clouds.clear()
+                    self._pictures.clear()
+            self._is_receiving_bulk = on
 
     span = None
 
@@ -501,4 +533,7 @@ class WorldSource(Closeable):
 
     def close(self) -> None:
         """Stop listening. A second call does nothing."""
+        with self._bulk_lock:
+            self._is_closed = True
+            self._bulk.close()
         self._opened.close()

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from helpers.cli_runner import (
     run_cli,
     started,
 )
-from helpers.pictures import video_file
-from helpers.processes import DEADLINE_S, until
+from helpers.pictures import jpeg, video_file
+from helpers.processes import DEADLINE_S, repeated, until
 
 from zstate import TransformListener, connect
-from zstate.cameras import CameraListener
+from zstate.cameras import Camera, CameraListener, CameraPublisher
 from zstate.cameras.cli.mesh_files import MeshFiles
 from zstate.model.geometry import MeshFile
 
@@ -30,6 +31,9 @@ camera_matrix: {{rows: 3, cols: 3, data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}}
 distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}
 """
+
+LENS = Camera(64, 48, (60.0, 60.0, 31.5, 23.5), frame="lens")
+SECOND = 1_000_000_000
 
 
 def calibration(folder: Path, width: int = 64) -> str:
@@ -110,6 +114,26 @@ def test_a_simulated_camera_has_the_calibration_of_a_file_and_waits_for_its_fram
         text = failure("camera", "rrbot", *options, "--seconds", "0.5")
         assert "no picture in 0.5 s" in text
         assert "'rrbot/wrist'" in text
+
+
+@pytest.mark.parametrize("is_own", [False, True])
+def test_doctor_names_a_camera_whose_pictures_are_stamped_by_a_clock_of_its_own(is_own: bool):
+    """A driver that is not synchronised stamps by the time since the camera was switched on."""
+    switched_on = time.time_ns() - 1000 * SECOND if is_own else 0
+    picture = jpeg()
+    with (
+        connect() as session,
+        CameraPublisher(session, "r1", "wrist", LENS) as publisher,
+        repeated(lambda: publisher.publish(picture, time.time_ns() - switched_on), every_s=0.05),
+    ):
+        ended = run_cli("doctor", "r1", "--json")
+    (found,) = [one for one in json.loads(ended.stdout)["checks"] if one["name"] == "stamps"]
+    if is_own:
+        assert found["state"] == "broken"
+        assert re.search(r"image 'wrist' of .* stamps samples .* before the time here", found["text"])
+        assert "the time since it was switched on" in found["text"]
+    else:
+        assert found["state"] == "ok", found
 
 
 def test_meshes_that_are_not_found_are_named_once(capsys: pytest.CaptureFixture[str]):

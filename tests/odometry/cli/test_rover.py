@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 
+import click
+import pytest
+
 from zstate import load_model
 from zstate.cameras import Camera, SimulatedCamera, floor_surface
-from zstate.odometry.cli.rover import ROVER_LENS, ROVER_MODEL, ROVER_WHEELS, RoverCamera
+from zstate.errors import LibraryMissing
+from zstate.odometry.cli.rover import ROVER_LENS, ROVER_MODEL, ROVER_WHEELS, RoverCamera, run_rover
 from zstate.odometry.invariant_filter import ImuNoise
 from zstate.odometry.simulated_rover import SimulatedRover
 from zstate.sources.square_drive import WheelPair
@@ -30,3 +34,25 @@ def test_the_camera_still_takes_pictures_after_several_turns_of_the_rover():
         taken = camera.read(START + elapsed * SECOND)
         assert taken is not None
     assert rover.pose[2] > 2.0 * math.tau
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "text"),
+    [
+        (
+            ZeroDivisionError("0 s"),
+            click.ClickException,
+            r"camera of the rover raised .*0 s.*line \d",
+        ),
+        (LibraryMissing("pip install eyes"), LibraryMissing, "^pip install eyes$"),
+    ],
+)
+def test_a_sensor_that_fails_ends_the_process_with_the_reason(
+    sessions, monkeypatch: pytest.MonkeyPatch, error, kind, text
+):
+    def read(camera: RoverCamera, stamp: int):
+        raise error
+
+    monkeypatch.setattr(RoverCamera, "read", read)
+    with pytest.raises(kind, match=text):
+        run_rover(sessions[0], 50.0, "r2", with_camera=True)

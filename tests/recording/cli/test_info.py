@@ -6,15 +6,19 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import failure, run_cli
+from helpers.pictures import jpeg
 from helpers.processes import until
 from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from zstate.cameras.messages import CompressedImage
 from zstate.net.session import Session
+from zstate.net.streams import KeyPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.recording.recorder import Recorder
+from zstate.wire.native import encode, encoding_of
 
 
 @pytest.fixture
@@ -45,6 +49,25 @@ def test_info_agrees_with_rosbags(run: Path):
     assert info["bytes_per_s"] == info["size"] / info["duration_s"]
     assert (info["size"], info["complete"], info["losses"]) == (run.stat().st_size, True, [])
     assert info["files"] == [str(run)]
+
+
+def test_info_names_the_messages_that_the_recorder_did_not_get(
+    sessions: tuple[Session, Session], tmp_path: Path
+):
+    path = tmp_path / "run.mcap"
+    with (
+        Recorder(sessions[1], path, ["r1"]) as recorder,
+        KeyPublisher(sessions[0], "zstate/r1/image/wrist", encoding_of(CompressedImage)) as camera,
+    ):
+        until(lambda: camera.has_readers)
+        for seq in (1, 2, 5, 6, 8):  # without 3, 4 and 7
+            camera.put(encode(CompressedImage(STAMP + seq, seq, 7, "lens", "jpeg", jpeg())))
+        until(lambda: recorder.stats.messages.get(("r1", "image")) == 5)
+    assert facts(path)["missing"] == {"r1/image": 3}
+    assert "\n  3 messages of r1 image did not arrive, or were dropped\n" in run_cli("info", str(path)).stdout
+    damaged = path.with_name("cut.mcap")
+    damaged.write_bytes(path.read_bytes()[:-1])  # without its end, the file is searched
+    assert facts(damaged)["missing"] == {"r1/image": 3}
 
 
 def test_info_has_model_streams_rates_and_writers_of_a_robot(run: Path):

@@ -26,6 +26,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from zstate.errors import InvalidInput, RecordingError
+from zstate.recording.mcap.index import Summary
+from zstate.recording.mcap.records import BoundedFile
 from zstate.recording.mcap.writer import MIN_BYTES, RecordingWriter
 from zstate.recording.reader import RecordingReader
 from zstate.wire.ros2.qos import Qos
@@ -112,6 +114,23 @@ def test_latched_values_repeat_every_ten_seconds_at_the_start_of_a_chunk(tmp_pat
         repeated = [record for record in reader.records(["/robot_description"]) if record.payload == b"A"]
     assert [r.log_time for r in repeated] == [START, START + 10 * S, START + 20 * S]
     assert {r.publish_time for r in repeated} == {START}
+
+
+def test_a_message_that_fills_a_chunk_is_alone_in_it_so_that_readers_of_others_skip_it(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    with RecordingWriter(path) as writer:
+        clouds, joints = declare_channels(writer)
+        for n in range(9):
+            is_cloud = n % 3 == 2
+            payload = bytes([n]) * (2**20 if is_cloud else 100)
+            writer.write(clouds if is_cloud else joints, payload, START + n, START)
+    with BoundedFile(path) as file:
+        ranges = Summary(file).index().ranges
+    assert [len(one.channels or ()) for one in ranges] == [1] * 6
+    spans = [(one.first - START, one.last - START) for one in ranges]
+    assert spans == [(0, 1), (2, 2), (3, 4), (5, 5), (6, 7), (8, 8)]
+    with RecordingReader(path) as reader:
+        assert [record.payload[0] for record in reader.records()] == list(range(9))
 
 
 @pytest.mark.parametrize("is_due", [False, True])
@@ -294,6 +313,8 @@ def test_full_disk_error_says_so():
 REPEATED_STARTS_ON_A_FULL_DISK = """
 import os, resource, signal, sys
 from zstate.errors import RecordingError
+from zstate.recording.mcap.index import Summary
+from zstate.recording.mcap.records import BoundedFile
 from zstate.recording.mcap.writer import RecordingWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))

@@ -14,6 +14,7 @@ from helpers.scene_drawing import at, handles, is_visible, pose_in_fixed, sent_m
 
 from zstate.buffer.buffer import TransformBuffer  # noqa: E402
 from zstate.cameras import Camera  # noqa: E402
+from zstate.transform import Transform  # noqa: E402
 from zstate.view.pictures import Packet  # noqa: E402
 from zstate.view.scene.cameras import Cameras, field_of_view  # noqa: E402
 from zstate.view.scene.world import STALE_COLOR, DrawnFrames  # noqa: E402
@@ -22,6 +23,7 @@ from zstate.view.world_source import LiveSensor, WorldSource, WriterName  # noqa
 WRIST = WriterName("r1", "wrist")
 TREE = tree({"odom": None, "r1/lens": "odom"})
 PLACE = DrawnFrames(TREE, np.array([at(), at(1.0, 2.0, 3.0)]), "odom")
+STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 CAMERA = Camera(64, 48, (60.0, 60.0, 31.5, 23.5), frame="r1/lens")
 KEY = "zstate/r1/camera_info/wrist"
 
@@ -47,6 +49,7 @@ class Shown:
         self.source._cameras[KEY] = WRIST, CAMERA
         self.sensor = self.source._pictures[WRIST] = LiveSensor(self.clock)
         self.buffer = TransformBuffer()
+        self.buffer.insert_static(Transform("odom", "r1/lens", (1.0, 2.0, 3.0), STRAIGHT))
         self.count = 0
 
     def add(self, data: bytes, form="jpeg", frame: str = "r1/lens") -> None:
@@ -56,7 +59,7 @@ class Shown:
     def show(self, stamp: int | None = None, place: DrawnFrames = PLACE) -> None:
         self.clock.now_s += 0.11
         self.cameras.read(self.source, self.buffer, {}, stamp)
-        self.cameras.show(place)
+        self.cameras.show(self.buffer, place)
 
     def frustum(self):
         """The visible frustum; None if there is none."""
@@ -80,6 +83,33 @@ def test_frustum_has_the_bytes_of_the_picture_and_stands_at_the_frame(shown):
     assert pose_in_fixed(shown.server, path)[:3] == (1.0, 2.0, 3.0)
     assert frustum.fov == pytest.approx(2.0 * math.atan(24.0 / 60.0))
     assert frustum.aspect == pytest.approx(64 / 48)
+
+
+def test_frustum_stands_where_the_camera_was_at_the_stamp_of_its_picture(shown):
+    """The camera is at x = 1 m + 1 m/s t; its picture is of 0.2 s, and drawn at 0.5 s: there x is 1.5 m."""
+    buffer = shown.buffer = TransformBuffer(history_s=10.0)
+    place = DrawnFrames(TREE, np.array([at(), at(1.5)]), "odom")
+
+    def drive(*milliseconds: int) -> None:
+        for one in milliseconds:
+            position = (1.0 + 0.001 * one, 0.0, 0.0)
+            buffer.insert(Transform("odom", "r1/lens", position, STRAIGHT, stamp=one * 1_000_000))
+
+    def drawn_x() -> float:
+        shown.show(place=place)
+        (path,) = handles(shown.server, viser.CameraFrustumHandle)
+        return pose_in_fixed(shown.server, path)[0]
+
+    drive(0, 100)
+    shown.sensor.keep(Packet(200_000_000, "r1/lens", "jpeg", jpeg(), (1, 0)))
+    assert drawn_x() == pytest.approx(1.1)  # its pose has not arrived
+    drive(300, 500)
+    assert drawn_x() == pytest.approx(1.2)
+    drive(20_000, 20_010)
+    drawn_x()
+    assert shown.frustum() is None
+    ((what, why),) = shown.cameras.missing
+    assert (what, "history" in why) == ("frustum of r1/wrist", True)
 
 
 def test_picture_is_sent_once_and_at_most_ten_times_a_second(shown):

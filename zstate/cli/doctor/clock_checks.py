@@ -10,7 +10,8 @@ from zstate.clock import SYSTEM, format_stamp
 from zstate.errors import NoClock, format_duration
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import MeasuredOffset
-from zstate.net.topic_statistics import Window
+from zstate.net.topic_statistics import IntervalStatistics, Window
+from zstate.plugins import measured_streams
 
 _DISTURBS_NS = 20_000_000
 _BREAKS_NS = 1_000_000_000
@@ -51,7 +52,9 @@ def domains_check(clocks: Mapping[str, str]) -> Iterator[Check]:
 
 def stamps_check(probe: RobotProbe) -> Check:
     """Whether the stamps of all writers' samples are plausible sampling times."""
-    sampled = [(one.session, window) for one in probe.statistics() if (window := one.window()) is not None]
+    named = [(probe.writer_name(one.session), one) for one in probe.statistics()]
+    named += _sensors(probe)
+    sampled = [(writer, one.session, window) for writer, one in named if (window := one.window()) is not None]
     if not sampled:
         return skipped("stamps", "there is no sample")
     if probe.description is not None and (domain := probe.description.clock) not in ("", SYSTEM):
@@ -62,14 +65,22 @@ def stamps_check(probe: RobotProbe) -> Check:
     problems = [problem for one in sampled if (problem := _stamps_problem(probe, *one)) is not None]
     if problems:
         return first_broken(problems) or problems[0]
-    least, greatest = zip(*(window.delays for _, window in sampled), strict=True)
+    least, greatest = zip(*(window.delays for _, _, window in sampled), strict=True)
     low, high = (format_duration(max(delay, 0)) for delay in (min(least), max(greatest)))
     return ok("stamps", f"{low} to {high} old on arrival")
 
 
-def _stamps_problem(probe: RobotProbe, session: int, window: Window) -> Check | None:
+def _sensors(probe: RobotProbe) -> Iterator[tuple[str, IntervalStatistics]]:
+    """The samples of each sensor, with the name of the sensor and its writer."""
+    for stream in measured_streams():
+        names = {writer.session: f"{stream} {name!r}" for name, writer in probe.info.named(stream)}
+        for session, one in probe.measured[stream].writers.items():
+            yield f"{names.get(session, stream)} of {probe.writer_name(session)}", one.statistics
+
+
+def _stamps_problem(probe: RobotProbe, writer: str, session: int, window: Window) -> Check | None:
     """What is wrong with the stamps of one writer; None if they are plausible."""
-    writer, least = probe.writer_name(session), window.delays[0]
+    least = window.delays[0]
     stamp, stamps = window.received[-1].stamp, {one.stamp for one in window.received}
     if abs(least) > FAR_NS:
         size = f"{format_duration(abs(least))} {'before' if least > 0 else 'after'}"
@@ -79,12 +90,12 @@ def _stamps_problem(probe: RobotProbe, session: int, window: Window) -> Check | 
     if len(window.received) > 2 and len(stamps) == 1:
         text = f"{writer} gives every sample the same stamp, {format_stamp(stamp)}: its source stands still"
         return broken("stamps", text, f"zstate echo {probe.info.name}")
-    return _delay_problem(probe, session, least)
+    return _delay_problem(probe, writer, session, least)
 
 
-def _delay_problem(probe: RobotProbe, session: int, least: int) -> Check | None:
+def _delay_problem(probe: RobotProbe, writer: str, session: int, least: int) -> Check | None:
     """A writer whose samples do not arrive soon after their stamps; ``least`` is the least delay [ns]."""
-    writer, cause, then = probe.writer_name(session), "", _SET_CLOCKS
+    cause, then = "", _SET_CLOCKS
     for measured in probe.offsets:
         if measured.writer.session == session and abs(measured.offset_ns) > _DISTURBS_NS:
             cause = f": {_offset_text(measured)}"

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import threading
-from contextlib import ExitStack, suppress
+import traceback
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from zstate.cli.options import load_robot
-from zstate.errors import Closed, LibraryMissing
+from zstate.cli.output.console import fail
+from zstate.errors import Closed, LibraryMissing, ZStateError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from zstate.buffer.buffer import TransformBuffer
     from zstate.cameras import Camera, SimulatedCamera, StampedPicture
+    from zstate.driving import DriverHost
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.odometry import ImuPublisher
@@ -101,7 +104,10 @@ def check_camera() -> None:
 
 
 def run_rover(session: Session, rate_hz: float, robot: str = ROVER, *, with_camera: bool = False) -> None:
-    """Host the driver of the wheels of the rover ``robot``, publish its sensors, until a signal."""
+    """Host the driver of the wheels of the rover ``robot``, publish its sensors, until a signal.
+
+    A sensor that fails ends it, with the reason.
+    """
     from zstate.driving import DriverHost, Limits
     from zstate.driving.cli.drive import run_host
     from zstate.nodes.listener import TransformListener
@@ -131,21 +137,50 @@ def run_rover(session: Session, rate_hz: float, robot: str = ROVER, *, with_came
         )
         imu = opened.enter_context(ImuPublisher(session, robot, "imu", frame=ROVER_IMU, program="rover-imu"))
         opened.callback(stop.set)
-        _in_thread("rover imu", partial(_publish_imu, imu, rover, stop))
+        threads = _SensorThreads(host)
+        threads.start("IMU", partial(_publish_imu, imu, rover, stop))
         room = load_room()
         if room is not None:
-            opened.enter_context(_start_laser(session, robot, room, rover, mounts[ROVER_LASER]))
+            mount = mounts[ROVER_LASER]
+            opened.enter_context(_start_laser(session, robot, room, rover, mount, threads=threads))
         if with_camera:
-            opened.enter_context(_start_camera(session, robot, room, rover, model))
-        run_host(host, None)
+            opened.enter_context(_start_camera(session, robot, room, rover, model, threads=threads))
+        try:
+            run_host(host, None)
+        finally:
+            threads.check()
 
 
-def _in_thread(name: str, work: partial[object]) -> None:
-    def run() -> None:
-        with suppress(Closed):  # the end of the program
-            work()
+class _SensorThreads:
+    """The threads of the sensors. If one fails, ``host`` is closed, which ends its loop; ``check`` raises."""
 
-    threading.Thread(target=run, name=f"zstate {name}", daemon=True).start()
+    def __init__(self, host: DriverHost) -> None:
+        self._host = host
+        self._failure: tuple[str, BaseException] | None = None
+
+    def start(self, sensor: str, work: partial[object]) -> None:
+        """Call ``work`` in a thread."""
+
+        def run() -> None:
+            try:
+                work()
+            except Closed:
+                pass  # the end of the program
+            except BaseException as error:
+                self._failure = self._failure or (sensor, error)
+                self._host.close()
+
+        threading.Thread(target=run, name=f"zstate rover {sensor}", daemon=True).start()
+
+    def check(self) -> None:
+        """Raises what has ended the first thread that failed: a ZStateError, or a ClickException with it."""
+        if self._failure is None:
+            return
+        sensor, error = self._failure
+        if isinstance(error, ZStateError):
+            raise error
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        fail(f"the {sensor} of the rover raised {error!r} ({place.filename}, line {place.lineno})")
 
 
 def _mounts(model: RobotModel) -> dict[str, Transform]:
@@ -171,7 +206,13 @@ def _publish_imu(publisher: ImuPublisher, rover: SimulatedRover, stop: threading
 
 
 def _start_laser(
-    session: Session, robot: str, room: Grid, rover: SimulatedRover, mount: Transform
+    session: Session,
+    robot: str,
+    room: Grid,
+    rover: SimulatedRover,
+    mount: Transform,
+    *,
+    threads: _SensorThreads,
 ) -> ScanPublisher:
     from zstate.scans import ScanPublisher, SimulatedLaser
 
@@ -199,7 +240,7 @@ def _start_laser(
         frame=ROVER_LASER,
         program="rover-laser",
     )
-    _in_thread("rover laser", partial(publisher.run, _RoverLaser(laser, rover, mount), _SCAN_HZ))
+    threads.start("laser", partial(publisher.run, _RoverLaser(laser, rover, mount), _SCAN_HZ))
     return publisher
 
 
@@ -240,7 +281,13 @@ def _camera_mount() -> Transform:
 
 
 def _start_camera(
-    session: Session, robot: str, room: Grid | None, rover: SimulatedRover, model: RobotModel
+    session: Session,
+    robot: str,
+    room: Grid | None,
+    rover: SimulatedRover,
+    model: RobotModel,
+    *,
+    threads: _SensorThreads,
 ) -> ExitStack:
     """Publish the mount of the camera and its pictures, until the stack is closed."""
     from zstate.cameras import CameraPublisher, SimulatedCamera, floor_surface, robot_surfaces, wall_surface
@@ -258,7 +305,7 @@ def _start_camera(
         source = RoverCamera(SimulatedCamera(lens, surfaces), rover, model)
         publisher = CameraPublisher(session, robot, ROVER_CAMERA, lens, program="rover-camera")
         opening.enter_context(publisher)
-        _in_thread("rover camera", partial(publisher.run, source, _CAMERA_HZ))
+        threads.start("camera", partial(publisher.run, source, _CAMERA_HZ))
         return opening.pop_all()
 
 

@@ -70,6 +70,9 @@ def _head(info: RecordingInfo) -> Iterator[str]:
         yield f"{size_text(info.bytes_per_s)} a second, {size_text(info.bytes_per_s * _DAY_S)} a day"
     yield "complete" if info.complete else "not complete"
     yield from (f"  {loss}" for loss in info.losses)
+    for source, count in sorted(info.missing.items()):
+        robot, _, stream = source.partition("/")
+        yield f"  {count_text(count, 'message')} of {robot} {stream} did not arrive, or were dropped"
     yield from (_ADVICE.format(name) for name in _recoverable(info))
 
 
@@ -117,6 +120,7 @@ def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, An
         "compressions": info.compressions,
         "complete": info.complete,
         "losses": info.losses,
+        "missing": info.missing,
         "recoverable": _recoverable(info),
         "start": info.first,
         "end": info.last,

@@ -11,6 +11,7 @@ import re
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -24,6 +25,10 @@ from zstate.recording.storage import Channel, Format, ReadFilter, Record, Sorted
 IDENTITY = "zstate.recording"
 """Name of the metadata record; its keys are "id", and "part" (0, 1, ...)."""
 
+MISSING = "zstate.missing"
+"""Name of the metadata record with how many messages the recorder did not get, by "robot/stream"."""
+
+_COUNT = re.compile("[0-9]{1,18}")
 _SIGNATURES = {
     b"#ROSBAG V": "a bag of ROS 1: `rosbags-convert` makes a ROS 2 one of it",
     b"\x28\xb5\x2f\xfd": "compressed: `zstd -d` unpacks it",
@@ -57,9 +62,13 @@ class McapFile:
         with open_errors(path) as file:
             self.size = file.size
             try:
-                self._index = index = Summary(file).index()
+                summary = Summary(file)
+                self._index = index = summary.index()
+                metadata = summary.metadata(MISSING)
             except CorruptData:
-                self._index = index = FileScan(file).index
+                scan = FileScan(file)
+                self._index = index = scan.index
+                metadata = [one for one in scan.metadata if one.name == MISSING]
         self.profile, self.library = index.header.profile, index.header.library
         self._channels: dict[int, Channel] = {}
         for number, channel in index.channels.items():
@@ -71,6 +80,10 @@ class McapFile:
         self.compressions = tuple(sorted({one.compression for one in index.ranges} - {""}))
         self.complete = index.complete
         self.losses = tuple(map(str, index.losses))
+        stated = chain.from_iterable(one.metadata.items() for one in metadata)
+        self.missing: Mapping[str, int] = {
+            name: int(count) for name, count in stated if _COUNT.fullmatch(count)
+        }
 
     def parts(self, read_filter: ReadFilter) -> list[SortedPart]:
         selected = {

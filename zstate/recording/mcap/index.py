@@ -23,6 +23,7 @@ from mcap.records import (
     Footer,
     Header,
     Metadata,
+    MetadataIndex,
     Schema,
     Statistics,
 )
@@ -138,6 +139,7 @@ class RecordContents:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.chunks: list[ChunkIndex] = []
+        self.metadata: list[MetadataIndex] = []
         self.statistics: Statistics | None = None
         self.counts: Counter[int] = Counter()
         times: list[int] = []
@@ -154,6 +156,8 @@ class RecordContents:
                 self.channels[channel.id] = channel
             elif opcode == Opcode.CHUNK_INDEX:
                 self.chunks.append(parse_record(ChunkIndex, data[start:end]))
+            elif opcode == Opcode.METADATA_INDEX:
+                self.metadata.append(parse_record(MetadataIndex, data[start:end]))
             elif opcode == Opcode.STATISTICS:
                 self.statistics = parse_record(Statistics, data[start:end])
         self.first, self.last = min(times, default=0), max(times, default=0)
@@ -164,6 +168,7 @@ class Summary:
 
     def __init__(self, file: BoundedFile) -> None:
         footer = read_footer(file)
+        self._file = file
         self.start = footer.summary_start
         self._header, self._data_start = read_header(file)
         if not self._data_start <= self.start <= file.size - len(MAGIC) - _FOOTER_SIZE:
@@ -199,6 +204,17 @@ class Summary:
             times = chunk.message_start_time, chunk.message_end_time
             ranges.append(DataRange("chunk", start, end, *times, occurring, chunk.compression))
         return Index(self._header, schemas, channels, counts, span, tuple(ranges), complete=True)
+
+    def metadata(self, name: str) -> list[Metadata]:
+        """The metadata records of this name. Raises CorruptData if the summary leads elsewhere."""
+        found: list[Metadata] = []
+        for one in self.contents.metadata:
+            if one.name == name:
+                opcode, body = self._file.record(one.offset)
+                if opcode != Opcode.METADATA:
+                    raise CorruptData("its summary names a metadata record where none is")
+                found.append(parse_record(Metadata, body))
+        return found
 
 
 class FileScan:

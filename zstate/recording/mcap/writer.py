@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, RecordingError
-from zstate.recording.mcap.file import IDENTITY, later_splits, split_path
+from zstate.recording.mcap.file import IDENTITY, MISSING, later_splits, split_path
 from zstate.recording.storage import ChannelType
 from zstate.wire.ros2.qos import Qos
 
@@ -33,6 +33,7 @@ MAX_CHANNELS = 60_000
 GROUP_NS = 10_000_000_000
 """Interval at which latched messages are repeated [ns of log time]."""
 
+_CHUNK_BYTES = 1 << 20
 _MESSAGE_SIZE = 31  # of a message's record, without its payload
 _SEQUENCE = (1 << 32) - 1
 _END_OF_TIME = 1 << 63
@@ -119,7 +120,7 @@ class McapOutput:
         with suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._buffer = _ChunkBuffer(self._file)
-        self.writer = Writer(self._buffer, compression=CompressionType.ZSTD)
+        self.writer = Writer(self._buffer, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self.writer.start(profile, library)
 
     @property
@@ -244,8 +245,13 @@ class SplitFile:
         return True
 
     def add(self, message: RecordedMessage, *, is_repeated: bool = False) -> None:
-        """Write it: into memory, until the chunk is full."""
+        """Write it: into memory, until the chunk is full.
+
+        One that fills a chunk, as a cloud does, has one of its own: readers of other streams skip it.
+        """
         channel, payload, log_time, publish_time, sequence = message
+        if len(payload) >= _CHUNK_BYTES:
+            self.write_chunk()
         number = self._number_of[channel]
         self.output.writer.add_message(number, log_time, payload, publish_time, sequence & _SEQUENCE)
         self._chunk_size += len(payload) + _MESSAGE_SIZE
@@ -414,6 +420,13 @@ class RecordingWriter(Closeable):
         with self._writing():
             if self._is_open:
                 self._split.write_chunk()
+
+    def state_missing(self, counts: Mapping[str, int]) -> None:
+        """Write how many messages the recorder did not get, by "robot/stream"; once, before it closes."""
+        with self._writing():
+            self._check_open()
+            facts = {name: str(count) for name, count in counts.items()}
+            self._split.output.writer.add_metadata(MISSING, facts)
 
     def close(self) -> None:
         with self._writing():

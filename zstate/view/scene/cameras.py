@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import viser
 from zstate import se3
 from zstate.buffer.buffer import TransformBuffer
 from zstate.cameras.camera import Camera
+from zstate.errors import LookupFailed, NoData
 from zstate.view.pictures import Packet, PictureReader, StillPicture
 from zstate.view.scene.model_overlay import ModelOverlay
 from zstate.view.scene.robot_meshes import RobotKind
@@ -65,12 +67,11 @@ class Cameras:
         self._count = 0
         self._overlay = ModelOverlay()
 
-    def show(self, place: DrawnFrames) -> None:
-        """Draw the pictures that were read."""
+    def show(self, buffer: TransformBuffer, place: DrawnFrames) -> None:
+        """Draw the pictures that were read, each where its camera was at its stamp."""
         missing: list[tuple[str, str]] = []
         for name, shown in self.shown.items():
-            frame = shown.picture.packet.frame
-            pose = place.pose(frame)
+            pose, reason = camera_pose(shown.picture.packet, buffer, place)
             if shown.problem is not None:
                 missing.append((f"pictures of {name}", shown.problem))
             if shown.model_problem is not None:
@@ -78,7 +79,7 @@ class Cameras:
             if shown.camera is None:
                 missing.append((f"frustum of {name}", "its calibration, or one of this size, is not known"))
             elif pose is None:
-                missing.append((f"frustum of {name}", f"its frame {frame!r} has no pose in {place.fixed!r}"))
+                missing.append((f"frustum of {name}", reason))
             self._cameras[name].show(self._scene, shown, pose if self.frustums else None)
         self.missing = missing
 
@@ -123,6 +124,24 @@ class Cameras:
         if not newest or camera is None:
             return at
         return self._overlay.newest(camera, buffer, newest[0].stamp)
+
+
+def camera_pose(packet: Packet, buffer: TransformBuffer, place: DrawnFrames) -> tuple[se3.Pose | None, str]:
+    """The pose of a camera in ``place`` at the stamp of its picture; None with the reason if it is unknown.
+
+    Before the poses of that stamp arrive, it is the newest one before.
+    """
+    frame, stamp = packet.frame, packet.stamp
+    target = place.connected(frame)
+    drawn = place.pose(target)
+    if drawn is None or place.pose(frame) is None:
+        return None, f"its frame {frame!r} has no pose in {place.fixed!r}"
+    try:
+        with suppress(NoData):  # nothing moves
+            stamp = min(stamp, buffer.latest(target, frame))
+        return se3.compose(drawn, se3.unstack(buffer.lookup(target, frame, stamp).pose7)), ""
+    except LookupFailed as error:
+        return None, str(error)
 
 
 def last_packets(sensor: Sensor[Packet], at: int | None) -> Sequence[Packet]:

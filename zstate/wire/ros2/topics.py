@@ -31,6 +31,7 @@ from zstate.wire.messages import Edges
 from zstate.wire.ros2.options import Ros2Options, check_token
 from zstate.wire.ros2.streams import (
     has_named_topics,
+    ros_streams,
     ros_type,
     topic_stream,
     topic_suffix,
@@ -117,23 +118,25 @@ class DdsKeys(RmwKeys):
     """The same in zenoh-plugin-ros2dds: a key is the name of the topic, without its leading slash.
 
     A bridge puts its namespace before every topic, before /tf and /clock too. Its keys have no
-    domain, no type and no type hash, so of the topics that writers name only those with the names of the
-    streams can be read as such: ``scan``, ``imu``, ``map`` and so on; and those of cameras.
+    domain, no type and no type hash. So of the topics that writers name, a reader of all of them finds those
+    with the names of the streams, ``scan``, ``imu``, ``map`` and so on, and those of cameras; any other one
+    is read by its name.
     """
 
     def key(self, robot: str, stream: StreamName, name: str = "") -> str:
         return self.topic(robot, stream, name)[1:]
 
     def expression(self, robot: str, stream: StreamName, name: str = ANY) -> str:
-        last_name = name if topic_suffix(stream) else stream
-        return self._topic_pattern(robot, stream, last_name)[1:]
+        is_found = has_named_topics(stream) and (name != ANY or bool(topic_suffix(stream)))
+        return self._topic_pattern(robot, stream, name if is_found else stream)[1:]
 
     def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
     def writer_name(self, key: str) -> str | None:
         name = name_from_topic(key)
-        return name if has_named_topics(name) or without_suffix(key) != key else None
+        is_own = name in ros_streams() and not has_named_topics(name) and without_suffix(key) == key
+        return None if is_own else name
 
     def _topic(self, namespace: str, stream: StreamName, last_name: str) -> str:
         ros_type(stream)
