@@ -510,6 +510,55 @@ def recordings() -> Figure:
     return figure
 
 
+def sites() -> Figure:
+    """What crosses the uplink of a site."""
+    figure = Figure(720, 300, "A site's router thins what leaves for headquarters")
+    figure.box(16, 40, (300, 214), "", "bg")
+    figure.text(166, 28, "site plant1: all samples", "bold")
+    for y, name in ((60, "rrbot\n50 Hz"), (128, "r2\n50 Hz")):
+        figure.box(32, y, (90, 48), name, "fa")
+        figure.arrow((122, y + 24), (188, 114), "", "a", ">")
+    figure.box(190, 92, (108, 44), "router\n--site plant1", "fb")
+    figure.box(32, 196, (90, 44), "programs\n50 Hz", "fa")
+    figure.arrow((212, 136), (122, 214), "", "a", ">")
+    figure.box(470, 40, (234, 214), "", "bg")
+    figure.text(587, 28, "headquarters", "bold")
+    figure.box(486, 92, (84, 44), "router\nACL", "fb")
+    figure.box(600, 92, (90, 44), "readers\n5 Hz", "fa")
+    figure.arrow((570, 114), (598, 114), "", "a", ">")
+    figure.arrow((298, 106), (484, 106), "joint_states=5, tf=0", "b", ">")
+    figure.path(((645, 136), (645, 190), (250, 190), (250, 138)), "c dash", "<>")
+    figure.text(392, 183, "lookup(..., exact=True)", "code tc")
+    figure.text(392, 208, "the robot's own samples, on demand", "s t")
+    figure.caption(282, "Readers know that the samples are thinned on purpose, and by which site.")
+    return figure
+
+
+def archive() -> Figure:
+    """What is in an archive, and what reads it."""
+    figure = Figure(720, 236, "Recordings become Parquet files by stream, robot and date")
+    for n, name in enumerate(("monday.mcap", "tuesday.mcap", "...")):
+        figure.box(20, 34 + 54 * n, (130, 40), name, "fa")
+        figure.path(((150, 54 + 54 * n), (208, 108)), "m", ">")
+    figure.text(85, 214, "zstate archive --from", "code")
+    figure.box(210, 30, (196, 156), "", "fc")
+    for n, line in enumerate(("stream=joint_states", "robot=r17", "date=2026-11-20", "....parquet")):
+        figure.text(224 + 16 * n, 62 + 26 * n, line, "code", "start")
+    figure.text(308, 172, "models, static edges, writers", "s t")
+    rows = (
+        ("zstate.Archive", "lookups over months, as in a recording"),
+        ("DuckDB, Polars, Spark", "without zstate"),
+        ("zstate.archive.poses", "one function on many machines"),
+        ("zstate archive DIR cut", "a window as MCAP: view, plot, export"),
+    )
+    for n, (name, what) in enumerate(rows):
+        y = 44 + 42 * n
+        figure.path(((406, 108), (446, y + 2)), "m", ">")
+        figure.text(454, y, name, "code ta", "start")
+        figure.text(454, y + 16, what, "s t", "start")
+    return figure
+
+
 def dataset() -> Figure:
     """States at the stamps of images."""
     figure = Figure(720, 190, "Joint samples, images, and the state at each image")
@@ -643,7 +692,7 @@ def foxglove() -> Figure:
 
 
 FIGURES: Sequence[Callable[[], Figure]] = (
-    *(arrays, camera, chain, dataset, drivers, driving, ellipse, foxglove, lidar, network),
+    *(archive, arrays, camera, chain, dataset, drivers, driving, ellipse, foxglove, lidar, network),
     *(odometry_sources, panels),
     *(
         pose_in_odom,
@@ -651,6 +700,7 @@ FIGURES: Sequence[Callable[[], Figure]] = (
         ros,
         scan,
         simulated_time,
+        sites,
         streams,
         streams_of_a_publisher,
         timeline,
