@@ -204,7 +204,7 @@ def uplink(rates_hz: dict[str, float], robots: tuple[str, ...] = ("r1", "r2"), *
 
 def test_a_stream_that_passes_has_a_rule_for_each_robot_and_any_other_one_for_all():
     """Of a key that matches two rules Zenoh takes either, another one in each run: no two rules intersect."""
-    (item,) = uplink({"joint_states": 5.0, "tf": 0.0}).settings(())["downsampling"]  # type: ignore[misc]
+    (item,) = uplink({"joint_states": 5.0, "tf": 0.0}).settings(())["downsampling"]
     rates = {rule["key_expr"]: rule["freq"] for rule in item["rules"]}
     passing = {key for key, rate in rates.items() if rate}
     assert passing == {"zstate/r1/joint_states", "zstate/r2/joint_states"}
@@ -216,16 +216,16 @@ def test_a_stream_that_passes_has_a_rule_for_each_robot_and_any_other_one_for_al
 
 def test_a_sample_that_comes_a_little_early_passes_too():
     """At 5 of 50 Hz every tenth sample passes if it comes up to 8 ms early, and no ninth does."""
-    rules = uplink({"joint_states": 5.0}).settings(())["downsampling"][0]["rules"]  # type: ignore[index]
+    rules = uplink({"joint_states": 5.0}).settings(())["downsampling"][0]["rules"]
     least_s = 1.0 / rules[0]["freq"]
     assert 9 / 50 < least_s == pytest.approx(10 / 50 - 0.008)
 
 
 def test_the_uplink_is_told_by_protocol_or_by_interface():
-    assert uplink({}).settings(("tcp/127.0.0.1:7447",))["qos/network"][0]["link_protocols"] == ["tls"]  # type: ignore[index]
-    with pytest.raises(ConfigError, match=r"cannot be told from 'tls/\[::\]:7447'.*--wan"):
+    assert uplink({}).settings(("tcp/127.0.0.1:7447",))["qos/network"][0]["link_protocols"] == ["tls"]
+    with pytest.raises(ConfigError, match=r"cannot be distinguished from 'tls/\[::\]:7447'.*--wan"):
         uplink({}).settings(("tls/[::]:7447",))
-    item = uplink({}, interfaces=("wwan0",)).settings(("tls/[::]:7447",))["downsampling"][0]  # type: ignore[index]
+    item = uplink({}, interfaces=("wwan0",)).settings(("tls/[::]:7447",))["downsampling"][0]
     assert item["interfaces"] == ["wwan0"]
     assert "link_protocols" not in item
 

@@ -40,7 +40,7 @@ class Site(NamedTuple):
 
 @contextmanager
 def running_site(robots: tuple[str, ...], rates_hz: dict[str, float]) -> Iterator[Site]:
-    """The programs of a site use a socket file, so the uplink is told from it by its protocol."""
+    """The programs of a site use a socket file, so the uplink is distinguished from it by its protocol."""
     headquarters = f"tcp/127.0.0.1:{find_free_port()}"
     with ExitStack() as opened:
         folder = opened.enter_context(tempfile.TemporaryDirectory())

@@ -98,8 +98,8 @@ class Uplink:
     no sample passes, of any robot. Latched values, commands, stops, tokens, the simulated time, queries and
     their replies always pass; samples and values are dropped if the link is full, and never wait.
 
-    ``interfaces`` are the network interfaces of the link. Without them it is told from the local ones by its
-    protocol. Raises InvalidInput.
+    ``interfaces`` are the network interfaces of the link. Without them, its protocol distinguishes it from
+    the local ones. Raises InvalidInput.
     """
 
     site: str
@@ -141,7 +141,7 @@ class Uplink:
         """The sections ``downsampling`` and ``qos`` of a Zenoh configuration.
 
         ``others`` are the endpoints of all other links of the router. Raises ConfigError if the uplink cannot
-        be told from them.
+        be distinguished from them.
         """
         passing = {stream: self.rates_hz[stream] / _EARLY for stream in self.passing}
         # Of a key that matches two rules Zenoh takes any of them: no rule for all of a stream that passes.
@@ -155,7 +155,7 @@ class Uplink:
         }
 
     def _link(self, others: Sequence[str]) -> dict[str, list[str]]:
-        """What tells the uplink from other links."""
+        """The conditions by which the uplink is distinguished from other links."""
         if self.interfaces:
             return {"interfaces": list(self.interfaces)}
         protocols = {endpoint.partition("/")[0] for endpoint in self.endpoints}
@@ -163,7 +163,7 @@ class Uplink:
             protocol = min(shared)
             alike = next(endpoint for endpoint in others if endpoint.startswith(f"{protocol}/"))
             raise ConfigError(
-                f"the uplink {self.endpoints[0]!r} cannot be told from {alike!r}: both are {protocol}, and "
+                f"the uplink {self.endpoints[0]!r} cannot be distinguished from {alike!r}: both are {protocol}, and "
                 "links are thinned by protocol or network interface; give the interface of the uplink (--wan "
                 "wwan0), or choose another protocol for one of the two, such as quic for the uplink",
                 path="uplink",
@@ -260,7 +260,7 @@ class RouterConfig:
         return (*self.connect, *(self.uplink.endpoints if self.uplink is not None else ()))
 
     def settings(self) -> dict[str, object]:
-        """The Zenoh configuration. Raises ConfigError for an uplink that cannot be told from other links."""
+        """The Zenoh configuration. Raises ConfigError for an uplink that cannot be distinguished from other links."""
         settings: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
         if self._connected:
             settings |= {"connect/endpoints": list(self._connected), **_CONNECT_SETTINGS}

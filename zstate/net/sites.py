@@ -1,6 +1,6 @@
 """Sites: routers that thin what leaves on their uplink, and announce it.
 
-A thinned stream has gaps in its sequence numbers that are no losses; tools tell the two apart by the tokens
+A thinned stream has gaps in its sequence numbers that are no losses; tools distinguish the two by the tokens
 of sites.
 """
 

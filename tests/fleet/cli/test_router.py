@@ -201,7 +201,7 @@ def test_password_is_in_the_output_file_but_masked_in_print(tmp_path: Path, monk
 
 
 def test_a_site_prints_what_passes_and_runs_it(free_port: int, tmp_path: Path):
-    """Its own programs are told from headquarters by the protocol: a socket file here."""
+    """Its own programs are distinguished from headquarters by the protocol: a socket file here."""
     headquarters = f"tcp/127.0.0.1:{free_port}"
     local = f"unixsock-stream/{tmp_path / 'site.sock'}"
     (tmp_path / "robots.txt").write_text("# plant 1\nr1\nr2  # the second\n")
@@ -232,7 +232,7 @@ def test_a_site_prints_what_passes_and_runs_it(free_port: int, tmp_path: Path):
         (("--site", "plant1", "--uplink", "tls/hq:7447"), "names no robots"),
         (("--site", "plant1", "--uplink", "tls/hq:7447", "--downsample", "tf=1"), "exclude each other"),
         (("--site", "plant1", "--uplink", "tls/hq:7447", "--ros2"), "exclude each other"),
-        (("--site", "plant1", "--uplink", "tcp/hq:7447", "--robot", "r1"), "cannot be told from"),
+        (("--site", "plant1", "--uplink", "tcp/hq:7447", "--robot", "r1"), "cannot be distinguished from"),
         (
             ("--site", "plant1", "--uplink", "tls/hq:7447", "--robot", "r1", "--thin", "joints=5"),
             "'joints' cannot",
