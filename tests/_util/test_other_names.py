@@ -92,7 +92,7 @@ def test_a_buffer_refuses_copies_with_its_own_reason(duplicate: Callable[[object
 def test_error_of_a_listener_names_the_methods_of_its_buffer(sessions) -> None:
     with zstate.TransformListener(sessions[0]) as listener:
         for name, text in (
-            ("lookup", "it is buffer.lookup"),
+            ("can_lookup", "it is buffer.can_lookup"),
             ("lookupTransform", "tf2's lookupTransform is buffer.lookup(target, source, at) here, with "),
         ):
             with pytest.raises(AttributeError, match="'TransformListener' object has no attribute") as caught:

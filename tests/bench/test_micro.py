@@ -33,7 +33,9 @@ def test_list_has_a_line_for_each_program(capsys: pytest.CaptureFixture[str]) ->
 def test_every_program_has_a_measure_whose_parameters_have_defaults(name: str) -> None:
     tree = ast.parse((MODULES / f"{name}.py").read_text(encoding="utf-8"))
     [measure] = [one for one in tree.body if isinstance(one, ast.FunctionDef) and one.name == "measure"]
-    assert len(measure.args.args) == len(measure.args.defaults) > 0
+    given = measure.args
+    defaults = [one for one in (*given.defaults, *given.kw_defaults) if one is not None]
+    assert len([*given.args, *given.kwonlyargs]) == len(defaults) > 0
 
 
 def test_page_shows_programs_that_exist() -> None:

@@ -163,9 +163,10 @@ class Uplink:
             protocol = min(shared)
             alike = next(endpoint for endpoint in others if endpoint.startswith(f"{protocol}/"))
             raise ConfigError(
-                f"the uplink {self.endpoints[0]!r} cannot be distinguished from {alike!r}: both are {protocol}, and "
-                "links are thinned by protocol or network interface; give the interface of the uplink (--wan "
-                "wwan0), or choose another protocol for one of the two, such as quic for the uplink",
+                f"the uplink {self.endpoints[0]!r} cannot be distinguished from {alike!r}: both are "
+                f"{protocol}, and links are thinned by protocol or network interface; give the interface of "
+                "the uplink (--wan wwan0), or choose another protocol for one of the two, such as quic for "
+                "the uplink",
                 path="uplink",
             )
         return {"link_protocols": sorted(protocols)}
@@ -260,7 +261,7 @@ class RouterConfig:
         return (*self.connect, *(self.uplink.endpoints if self.uplink is not None else ()))
 
     def settings(self) -> dict[str, object]:
-        """The Zenoh configuration. Raises ConfigError for an uplink that cannot be distinguished from other links."""
+        """The Zenoh configuration. Raises ConfigError for an uplink that is not distinguished from other links."""
         settings: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
         if self._connected:
             settings |= {"connect/endpoints": list(self._connected), **_CONNECT_SETTINGS}
