@@ -261,7 +261,7 @@ class RouterConfig:
         return (*self.connect, *(self.uplink.endpoints if self.uplink is not None else ()))
 
     def settings(self) -> dict[str, object]:
-        """The Zenoh configuration. Raises ConfigError for an uplink that is not distinguished from other links."""
+        """The Zenoh configuration. Raises ConfigError as ``Uplink.settings``."""
         settings: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
         if self._connected:
             settings |= {"connect/endpoints": list(self._connected), **_CONNECT_SETTINGS}
