@@ -49,6 +49,17 @@ def _is_free(port: int) -> bool:
     return False
 
 
+def without_pauses(kinds: Iterable[str]) -> list[str]:
+    """The kinds of a writer's events, without the pauses of a writer on a busy machine: stale and resumed."""
+    kept: list[str] = []
+    for kind in kinds:
+        if kind == "resumed" and kept[-1:] == ["stale"]:
+            kept.pop()
+        else:
+            kept.append(kind)
+    return kept
+
+
 def new_threads(earlier: Iterable[threading.Thread]) -> set[threading.Thread]:
     """The threads of this process that are not among ``earlier`` ones, of which some may have ended."""
     return set(threading.enumerate()).difference(earlier)

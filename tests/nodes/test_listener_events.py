@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 import pytest
-from helpers.processes import Child, repeated, until
+from helpers.processes import Child, repeated, until, without_pauses
 from helpers.robots import RRBOT
 
 from zstate.ingest.diagnostics import WriterEvent
@@ -51,14 +51,8 @@ class EventCollector:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of the events, without the pauses of a writer on a busy machine: stale and resumed."""
-        kinds: list[str] = []
-        for event in self.events:
-            if event.kind == "resumed" and kinds[-1:] == ["stale"]:
-                kinds.pop()
-            else:
-                kinds.append(event.kind)
-        return tuple(kinds)
+        """The kinds of the events, without pauses."""
+        return tuple(without_pauses(event.kind for event in self.events))
 
     def await_kinds(self, *kinds: str) -> WriterEvent:
         """The last event, once exactly these kinds were reported."""
