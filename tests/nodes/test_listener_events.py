@@ -62,13 +62,13 @@ class EventCollector:
         return self.events[-1]
 
     def freeze(self, writer: Child) -> None:
-        """Freeze a writer that publishes."""
-        self.await_samples()
+        """Freeze a writer that publishes, once its period is known, also if its first samples were late."""
+        self.await_samples(50)
         writer.freeze()
 
-    def await_samples(self) -> None:
+    def await_samples(self, count: int = 3) -> None:
         received = self.listener.stats.received
-        until(lambda: self.listener.stats.received > received + 2)
+        until(lambda: self.listener.stats.received >= received + count)
 
 
 @pytest.fixture
