@@ -20,7 +20,7 @@ from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosTy
 class DisplayedForm(NamedTuple):
     """The form of those messages of a stream that viewers do not display as ROS carries them.
 
-    ``applies(message)`` tells whether a message is one of these. ``type``, ``suffix``, ``encode`` and
+    ``applies(message)`` is true of a message that is one of these. ``type``, ``suffix``, ``encode`` and
     ``decode`` are as in RosStream. Without ``decode`` recordings have ROS's form, and only viewers of live
     robots get this one.
     """
