@@ -14,6 +14,8 @@ from zstate.cameras.camera import camera_to_message
 from zstate.cameras.messages import CompressedImage
 from zstate.clouds.cloud import Cloud, cloud_to_message
 from zstate.clouds.messages import PointCloud
+from zstate.recording.mcap.index import Summary
+from zstate.recording.mcap.records import BoundedFile
 from zstate.scans import Scan
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.data_source import ViewSource
@@ -172,6 +174,24 @@ def test_recorded_clouds_are_read_again_for_more_points(with_clouds: ViewSource)
     assert counts() == [10, 10, 10]
     world.limit_clouds(TOP, 40)
     assert counts() == [40, 40, 40]
+
+
+def test_of_large_clouds_only_the_headers_and_those_on_display_are_read(tmp_path: Path):
+    path = tmp_path / "clouds.mcap"
+    with RecordingBuilder(path) as builder:
+        for n in range(5):
+            stamp = START + n * 100 * MS
+            builder.edges("cart", stamp, {("odom", "lidar"): pose(n)})
+            builder.encoder.write_message("cart", cloud_message(stamp, 100_000, n), stamp + MS, "top")
+    with BoundedFile(path) as file:
+        last = Summary(file).index().ranges[-1]
+    damaged = bytearray(path.read_bytes())
+    damaged[last.end - 1000] ^= 0xFF  # in the points of the last cloud
+    path.write_bytes(damaged)
+    with ViewSource.from_recording(path) as source:
+        sensor = source.world.clouds[TOP]
+        assert sensor.span == (START, START + 400 * MS)
+        assert [cloud.xyz[0, 0] for cloud in sensor.latest(1, START)] == [0.0]
 
 
 def test_recorded_pictures_and_calibrations_are_those_of_the_instant(tmp_path: Path):

@@ -29,6 +29,7 @@ from zstate.wire.messages import (
     TransformSample,
     with_field,
 )
+from zstate.wire.ros2.cdr import CdrReader
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.streams import (
@@ -168,6 +169,15 @@ class DecodedMessage(NamedTuple):
     log_time: int
 
 
+class RecordedHeader(NamedTuple):
+    """The header of one message, its writer, and when it was recorded [ns]; ``frame`` is the message's."""
+
+    writer: RecordedWriter
+    stamp: int
+    frame: str
+    log_time: int
+
+
 class UndecodedRecord(NamedTuple):
     """One record, the decoder of its channel, and the sequence number of its message."""
 
@@ -292,15 +302,20 @@ class DecodedRecording:
         streams: Collection[StreamName] = STREAMS,
         begin: int | None = None,
         end: int | None = None,
+        *,
+        heads_only: bool = False,
     ) -> Iterator[UndecodedRecord]:
-        """The records of ``messages`` and of their covariances, for readers that decode many together."""
+        """The records of ``messages`` and of their covariances, for readers that decode many together.
+
+        ``heads_only`` as of ``RecordingReader.records``.
+        """
         selected = {writer for writer in self.writers_of(robots) if writer.stream in streams}
         topics = {topic for topic, writers in self._topics.items() if writers & selected}
         counts: Counter[RecordedWriter] = Counter()
         last: Channel | None = None
         decoder: ChannelDecoder | None = None
         # Without topics there is nothing to read, while None would mean all.
-        for record in self._reader.records(topics, begin, end) if topics else ():
+        for record in self._reader.records(topics, begin, end, heads_only=heads_only) if topics else ():
             if record.channel is not last:  # the hash of a channel costs as much as its record
                 last, decoder = record.channel, self._decoder(record.channel)
                 if decoder is not None and decoder.writer not in selected:
@@ -312,6 +327,21 @@ class DecodedRecording:
                 counts[decoder.writer] += 1
                 seq = counts[decoder.writer]
             yield UndecodedRecord(decoder, record, seq)
+
+    def headers(self, stream: StreamName) -> Iterator[RecordedHeader]:
+        """The headers of all messages on ``stream``, whose ROS type begins with a header, by log time.
+
+        Of a message that has a chunk of its own only the beginning is read. One without is left out and
+        refused.
+        """
+        for channel, record, _ in self.records(streams=(stream,), heads_only=True):
+            try:
+                reader = CdrReader(record.payload, record.type_name)
+                stamp, frame = reader.stamp(), channel.names.to_zstate(reader.text())
+            except MessageError as error:
+                self._refuse(error.reason, f"{record.topic}: {error}")
+            else:
+                yield RecordedHeader(channel.writer, stamp, frame, record.log_time)
 
     def _decoder(self, channel: Channel) -> ChannelDecoder | None:
         if channel not in self._known:

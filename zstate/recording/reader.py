@@ -93,12 +93,17 @@ class RecordingReader(Closeable):
         return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     def records(
-        self, topics: Collection[str] | None = None, begin: int | None = None, end: int | None = None
+        self,
+        topics: Collection[str] | None = None,
+        begin: int | None = None,
+        end: int | None = None,
+        *,
+        heads_only: bool = False,
     ) -> Iterator[Record]:
         """The records of these topics (None: of all) with log times in [begin, end), by log time.
 
         Records of one instant are in the order of writing. Only chunks that may contain some are read, one
-        after the other.
+        after the other; with ``heads_only`` the beginning of those with one message, and of its payload.
         """
         if not self._is_open:
             raise RecordingError(f"the recording {str(self.path)!r} is closed", path=str(self.path))
@@ -106,6 +111,7 @@ class RecordingReader(Closeable):
             None if topics is None else frozenset(topics),
             -(1 << 63) if begin is None else begin,
             1 << 64 if end is None else end,
+            heads_only,
         )
         return merge_by_log_time([part for storage in self.storages for part in storage.parts(read_filter)])
 

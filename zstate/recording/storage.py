@@ -92,11 +92,15 @@ class Record(NamedTuple):
 
 
 class ReadFilter(NamedTuple):
-    """Selects records of these topics (None: all) with log times in [begin, end)."""
+    """Selects records of these topics (None: all) with log times in [begin, end).
+
+    With ``heads_only`` the payload of a message that has a chunk of its own may be its beginning only.
+    """
 
     topics: frozenset[str] | None
     begin: int
     end: int
+    heads_only: bool = False
 
     def accepts(self, channel: Channel) -> bool:
         """Whether records of ``channel`` are read at all."""

@@ -21,7 +21,7 @@ from zstate.nodes.listener import TransformListener
 from zstate.recording.decode import STREAMS
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.view.recorded_world import RecordedWorld
-from zstate.view.world_source import WORLD_STREAMS, WorldData, WorldSource
+from zstate.view.world_source import DECODED_STREAMS, WorldData, WorldSource
 from zstate.wire.keys import ANY
 
 _HOLD_S = 0.5
@@ -69,8 +69,9 @@ class ViewSource(Closeable):
         buffer = TransformBuffer(HISTORY_S)
         with Recording(path) as recording, ExitStack() as opening:
             world = opening.enter_context(RecordedWorld(path))
-            for decoded in recording.fill(buffer, (*STREAMS, *WORLD_STREAMS)):
+            for decoded in recording.fill(buffer, (*STREAMS, *DECODED_STREAMS)):
                 world.add(decoded, buffer)
+            world.add_clouds()
             source = cls(None, buffer=buffer, world=world)
             source._recorded = recording.robots
             opening.pop_all()

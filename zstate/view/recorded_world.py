@@ -1,7 +1,7 @@
 """Scans, clouds, pictures and maps to draw, from a recording.
 
 They stay in the file: a lidar writes more than all joints of a robot together. ``RecordedWorld`` indexes them
-once, while the poses are loaded, and reads those around the instant on display.
+once, while the poses are loaded, clouds by their headers only, and reads those around the instant on display.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from zstate.clouds.messages import PointCloud
 from zstate.clouds.plugin import CLOUD
 from zstate.errors import InvalidInput
 from zstate.ingest.deadline import PERIODS, is_stale
-from zstate.recording.decode import DecodedMessage, DecodedRecording, LatchedState
+from zstate.recording.decode import DecodedMessage, DecodedRecording, LatchedState, RecordedHeader
 from zstate.recording.reader import RecordingReader
 from zstate.scans.grid import Grid, grid_from_message
 from zstate.scans.messages import LaserScan, OccupancyGrid
@@ -37,6 +37,7 @@ from zstate.streams import StreamName
 from zstate.view.pictures import Packet, packet_from_message
 from zstate.view.thinned_cloud import ThinnedCloud, thinned_cloud
 from zstate.view.world_source import CLOUD_POINTS, TIME_JUMP_NS, M, Measured, WriterName
+from zstate.wire.keys import full_name
 from zstate.wire.messages import Message
 
 _SCANS_AHEAD = 30
@@ -54,30 +55,47 @@ class RecordedSensor(Generic[M]):
 
     One that is not newer than the one before is left out; one that is more than a second older begins again,
     as the poses do when a clock was set back. ``read(begin, end)`` yields those with log times [ns] in
-    [begin, end), ``ahead`` more than are needed. ``problem`` is why the end of the newest one on display has
-    no pose, None if it has one.
+    [begin, end), ``ahead`` more than are needed. ``lasts_ns`` is how long each takes if only its stamp is
+    read for the index. ``problem`` is why the end of the newest one on display has no pose, None if it has
+    one.
     """
 
-    def __init__(self, read: Callable[[int, int], Iterator[M]], ahead: int = _SCANS_AHEAD) -> None:
+    def __init__(
+        self,
+        read: Callable[[int, int], Iterator[M]],
+        ahead: int = _SCANS_AHEAD,
+        lasts_ns: int | None = None,
+    ) -> None:
         self.frame: str | None = None
         self.problem: str | None = None
         self._read = read
         self._ahead = ahead
+        self._lasts_ns = lasts_ns
         self._ends: list[int] = []
         self._log_times: list[int] = []
-        self._loaded: dict[int, M] = {}
-        """By row of the index."""
+        self._loaded: dict[int, M | None] = {}
+        """By row of the index; None for one that cannot be read."""
 
     def add(self, measured: Measured, log_time: int) -> None:
         """Index the next one of the recording."""
-        if self._ends and measured.end_stamp <= self._ends[-1]:
-            if measured.end_stamp >= self._ends[-1] - TIME_JUMP_NS:
+        self._add_end(measured.frame, measured.end_stamp, log_time)
+
+    def add_start(self, frame: str, stamp: int, log_time: int) -> None:
+        """Index the next one, measured in ``frame`` from ``stamp`` [ns] on for ``lasts_ns``."""
+        self._add_end(frame, stamp + (self._lasts_ns or 0), log_time)
+
+    def _add_end(self, frame: str, end: int, log_time: int) -> None:
+        if self._ends and end <= self._ends[-1]:
+            if end >= self._ends[-1] - TIME_JUMP_NS:
                 return
             self._ends.clear()
             self._log_times.clear()
-        self.frame = measured.frame
-        self._ends.append(measured.end_stamp)
+        self.frame = frame
+        self._ends.append(end)
         self._log_times.append(log_time)
+
+    def _end_of(self, measured: Measured) -> int:
+        return measured.end_stamp if self._lasts_ns is None else measured.stamp + self._lasts_ns
 
     def read_again(self) -> None:
         """Forget what was read."""
@@ -109,7 +127,7 @@ class RecordedSensor(Generic[M]):
     def _rows(self, rows: range) -> Sequence[M]:
         if not all(row in self._loaded for row in rows):
             self._load(range(rows.start, min(rows.stop + self._ahead, len(self._ends))))
-        return [self._loaded[row] for row in rows if row in self._loaded]
+        return [one for row in rows if (one := self._loaded.get(row)) is not None]
 
     def is_stale(self, at: int | None) -> bool:
         """Whether the sensor had missed its deadline ``at`` [ns]. Never at the end of the recording."""
@@ -127,10 +145,11 @@ class RecordedSensor(Generic[M]):
         """Keep these rows, and read the missing ones."""
         loaded = {row: one for row, one in self._loaded.items() if row in rows}
         missing = [row for row in rows if row not in loaded]
+        loaded.update(dict.fromkeys(missing))
         for one in self._read(self._log_times[missing[0]], self._log_times[missing[-1]] + 1):
-            row = bisect_left(self._ends, one.end_stamp)
-            if row in rows and self._ends[row] == one.end_stamp:
-                loaded.setdefault(row, one)
+            row = bisect_left(self._ends, end := self._end_of(one))
+            if row in missing and self._ends[row] == end and loaded[row] is None:
+                loaded[row] = one
         self._loaded = loaded
 
 
@@ -199,8 +218,8 @@ class LogTimes:
 class RecordedWorld(Closeable):
     """The scans, clouds, pictures and maps of all robots in the recording at ``path``, at any instant of it.
 
-    Call ``add`` with each message before anything is drawn. One thread draws; another may close.
-    Raises RecordingError if the recording cannot be read.
+    Call ``add`` with each message, and ``add_clouds``, before anything is drawn. One thread draws; another
+    may close. Raises RecordingError if the recording cannot be read.
     """
 
     problems: Sequence[tuple[str, str]] = ()
@@ -234,8 +253,6 @@ class RecordedWorld(Closeable):
         is_value = isinstance(decoded.message, (OccupancyGrid, CameraInfo)) and self._add_value(decoded)
         if isinstance(decoded.message, LaserScan):
             self._add_scan(decoded)
-        if isinstance(decoded.message, PointCloud):
-            self._add_cloud(decoded)
         if isinstance(decoded.message, CompressedImage):
             self._add_picture(decoded)
         due = self._log_times.due
@@ -249,12 +266,22 @@ class RecordedWorld(Closeable):
                 self.sensors[name] = RecordedSensor(partial(self._read_scans, name))
             self.sensors[name].add(scan, decoded.log_time)
 
-    def _add_cloud(self, decoded: DecodedMessage) -> None:
-        cloud, name = self._to_cloud(decoded), _name(decoded)
-        if cloud is not None:
+    def add_clouds(self) -> None:
+        """Index all clouds by their headers: only one of each sensor is read, for how long a turn takes."""
+        for header in self._recording.headers(CLOUD.name):
+            name = _name(header)
             if name not in self.clouds:
-                self.clouds[name] = RecordedSensor(partial(self._read_clouds, name), _FEW_AHEAD)
-            self.clouds[name].add(cloud, decoded.log_time)
+                if (lasts_ns := self._cloud_duration(name, header.log_time)) is None:
+                    continue
+                read = partial(self._read_clouds, name)
+                self.clouds[name] = RecordedSensor(read, _FEW_AHEAD, lasts_ns)
+            self.clouds[name].add_start(full_name(name.robot, header.frame), header.stamp, header.log_time)
+
+    def _cloud_duration(self, name: WriterName, log_time: int) -> int | None:
+        """How long after its stamp the cloud recorded at ``log_time`` ends [ns]; None if it is none."""
+        messages = self._messages(name, CLOUD.name, log_time, log_time + 1)
+        clouds = (self._to_cloud(decoded) for decoded in messages)
+        return next((one.end_stamp - one.stamp for one in clouds if one is not None), None)
 
     def limit_clouds(self, name: WriterName, points: int) -> None:
         """Keep at most so many points of each cloud of a sensor, by default 200,000."""
@@ -371,5 +398,5 @@ class RecordedWorld(Closeable):
             self._reader.close()
 
 
-def _name(decoded: DecodedMessage) -> WriterName:
+def _name(decoded: DecodedMessage | RecordedHeader) -> WriterName:
     return WriterName(decoded.writer.robot, decoded.writer.edge_writer or "")

@@ -64,8 +64,8 @@ _FURTHER = {
 }
 _ALWAYS = SCAN.name, CAMERA_INFO.name, MAP.name
 _BULK = CLOUD.name, IMAGE.name
-WORLD_STREAMS = *_ALWAYS, *_BULK
-"""What surrounds robots."""
+DECODED_STREAMS = *_ALWAYS, IMAGE.name
+"""What surrounds robots, and is decoded to index a recording; of clouds the headers are enough."""
 
 TIME_JUMP_NS = 1_000_000_000
 """A measurement that is so much older than the last one begins again."""

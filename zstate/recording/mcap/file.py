@@ -100,9 +100,16 @@ class McapFile:
     def _records(
         self, data_range: DataRange, selected: Mapping[int, Channel], read_filter: ReadFilter
     ) -> Iterator[Record]:
-        _, begin, end = read_filter
+        _, begin, end, heads_only = read_filter
         records: list[Record] = []
         with open_errors(self.path) as file:
+            if heads_only and (head := data_range.head(file)) is not None:
+                start, stop, data = head
+                number, sequence, log_time, publish_time = MESSAGE.unpack_from(data, start)
+                if begin <= log_time < end:
+                    payload = data[start + MESSAGE.size : stop]
+                    yield Record(selected[number], payload, log_time, publish_time, sequence)
+                return
             data = data_range.content(file)
             for opcode, start, stop in iter_records(data):
                 if opcode != Opcode.MESSAGE:

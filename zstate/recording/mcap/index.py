@@ -39,10 +39,13 @@ from zstate.recording.mcap.records import (
     decompress,
     decompress_prefix,
     iter_records,
+    only_message,
     parse_chunk,
     parse_record,
 )
 
+_HEAD_BYTES = 1 << 17
+"""One block of zstd, compressed or not."""
 _FOOTER_SIZE = HEAD.size + 20
 _CRC_SIZE = 4
 
@@ -70,6 +73,13 @@ class DataRange(NamedTuple):
     last: int = 0
     channels: frozenset[int] | None = None
     compression: str = ""
+
+    def head(self, file: BoundedFile) -> tuple[int, int, bytes] | None:
+        """The beginning of a chunk that has one message: see ``only_message``; None of others."""
+        if self.kind != "chunk" or self.channels is None or len(self.channels) > 1:
+            return None
+        end = min(self.end, self.offset + _HEAD_BYTES)
+        return only_message(parse_chunk(file.body(self.offset, end), whole=False), _HEAD_BYTES)
 
     def content(self, file: BoundedFile) -> bytes:
         """Its records, decompressed. Raises CorruptData if they are not whole."""

@@ -186,9 +186,32 @@ def _decompressed(chunk: Chunk) -> bytes:
     raise CorruptData(f"a chunk with the unknown compression {chunk.compression!r}")
 
 
+def only_message(chunk: Chunk, size: int) -> tuple[int, int, bytes] | None:
+    """The first ``size`` bytes of a chunk that has one message, and where the message begins and ends.
+
+    ``chunk`` may be cut off. None if it has more messages, or the message begins later.
+    """
+    data, at = _prefix(chunk, size), 0
+    while len(data) - at >= HEAD.size + MESSAGE.size:
+        opcode, length = HEAD.unpack_from(data, at)
+        start, at = at + HEAD.size, at + HEAD.size + length
+        if opcode == Opcode.MESSAGE:
+            return (start, at, data) if at == chunk.size and length >= MESSAGE.size else None
+    return None
+
+
 def decompress_prefix(chunk: Chunk) -> bytes:
     """The whole records at the beginning of a chunk that is cut off."""
-    limit = min(chunk.size, MAX_CHUNK_BYTES)
+    data, end = _prefix(chunk, MAX_CHUNK_BYTES), 0
+    with suppress(CorruptData):
+        for _, _, stop in iter_records(data):
+            end = stop
+    return data[:end]
+
+
+def _prefix(chunk: Chunk, size: int) -> bytes:
+    """At most ``size`` bytes of the content of a chunk; none of one that cannot be decompressed."""
+    limit = min(chunk.size, size)
     try:
         if chunk.compression == "zstd":
             with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
@@ -196,11 +219,7 @@ def decompress_prefix(chunk: Chunk) -> bytes:
         elif chunk.compression == "lz4":
             data = bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=limit))
         else:
-            data = chunk.data
+            data = chunk.data[:limit]
     except _UNREADABLE:
         return b""
-    end = 0
-    with suppress(CorruptData):
-        for _, _, stop in iter_records(data):
-            end = stop
-    return data[:end]
+    return data
