@@ -59,6 +59,15 @@ class RecordingInfo:
         return self.size / self.duration_s if self.duration_s > 0.0 else None
 
     @property
+    def is_missing_known(self) -> bool:
+        """Whether ``missing`` is all that the recorder did not get, which one of zstate states when it ends.
+
+        Not of a recorder that was killed, also if its file was recovered, nor of others.
+        """
+        is_stated = all(one.startswith("zstate") and "recovered" not in one for one in self.libraries)
+        return is_stated and (self.complete or bool(self.missing))
+
+    @property
     def message_count(self) -> int:
         return sum(channel.count for channel in self.channels)
 

@@ -109,8 +109,12 @@ def test_truncated_recording_is_reported_with_the_recover_command(run: Path):
     assert "\nnot complete\n" in text
     assert f"`zstate recover {run}`" in text
     assert "r1: model " in text
+    assert "how many messages did not arrive, and what followed, is not known" in " ".join(text.split())
     info = facts(run)
-    assert (info["complete"], info["recoverable"]) == (False, [str(run)])
+    assert (info["complete"], info["missing_known"], info["recoverable"]) == (False, False, [str(run)])
+    whole = run.with_name("whole.mcap")
+    run_cli("recover", str(run), str(whole))
+    assert [facts(whole)[name] for name in ("complete", "missing_known")] == [True, False]
 
 
 def test_info_of_a_ros_bag_lists_other_topics(tmp_path: Path):

@@ -27,6 +27,11 @@ _HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
 _DAY_S = 86_400.0
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
 
+_UNKNOWN = (
+    "  the recorder did not end: the counts are of what it wrote until then; how many messages did not arrive, "
+    "and what followed, is not known"
+)
+
 
 @click.command("info")
 @click.argument("file")
@@ -73,6 +78,8 @@ def _head(info: RecordingInfo) -> Iterator[str]:
     for source, count in sorted(info.missing.items()):
         robot, _, stream = source.partition("/")
         yield f"  {count_text(count, 'message')} of {robot} {stream} did not arrive, or were dropped"
+    if not info.is_missing_known and any("zstate" in library for library in info.libraries):
+        yield _UNKNOWN
     yield from (_ADVICE.format(name) for name in _recoverable(info))
 
 
@@ -121,6 +128,7 @@ def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, An
         "complete": info.complete,
         "losses": info.losses,
         "missing": info.missing,
+        "missing_known": info.is_missing_known,
         "recoverable": _recoverable(info),
         "start": info.first,
         "end": info.last,
