@@ -154,3 +154,9 @@ def test_wrong_arguments_are_refused_at_once(sessions):
         CloudListener(sessions[1], "r1", timeout_s=-1.0)
     with pytest.raises(InvalidInput, match="robot"):
         CloudListener(sessions[1], "a/b", "odom")
+
+
+@pytest.mark.parametrize("wire", ["ros2dds", "ros2dds:namespace=*"])
+def test_clouds_behind_a_ros2dds_bridge_need_the_name_of_their_topic(sessions, wire: str):
+    with pytest.raises(InvalidInput, match="pass it: sensor='velodyne_points'"):
+        CloudListener(sessions[1], "r1", wire=wire)

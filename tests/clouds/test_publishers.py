@@ -22,7 +22,7 @@ def received(sessions: Any, wire: str, *args: Any, **options: Any) -> PlacedClou
     writer, reader = sessions
     published = {name: options.pop(name) for name in ("stamp", "times") if name in options}
     with (
-        CloudListener(reader, "r1", wire=wire) as clouds,
+        CloudListener(reader, "r1", sensor="cloud" if wire == "ros2dds" else "*", wire=wire) as clouds,
         CloudPublisher(writer, "r1", "cloud", wire, frame="lidar", **options) as publisher,
         repeated(lambda: publisher.publish(*args, **published), every_s=0.05),
     ):

@@ -12,10 +12,12 @@ from zstate.checks import Points
 from zstate.clock import Clock
 from zstate.clouds.cloud import Cloud, cloud_from_message
 from zstate.clouds.messages import PointCloud
+from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.nodes.placing_listener import ByteLimits, PlacingListener
 from zstate.wire.keys import ANY
 from zstate.wire.messages import Message
+from zstate.wire.registry import get_wire
 
 _LIMITS = ByteLimits(unread=256 * 2**20, waiting=128 * 2**20)
 """Reached before 256 clouds: by 55 and 45 of 130,000 points with intensity, ring and time."""
@@ -70,9 +72,9 @@ class CloudListener(PlacingListener[Cloud, PlacedCloud]):
     reason; the first of each reason is also logged.
 
     ``sensor`` selects one sensor of the robot; "*": all of them. On the wire "ros2dds", whose keys have no
-    types, "*" is that of the topic ``cloud``. Frames come from ``buffer``; without one, the listener fills a
-    buffer of its own with the transforms of the robot. Bare frame names are the robot's own. A context
-    manager.
+    types, it is needed: the name of the topic, as "velodyne_points". Frames come from ``buffer``; without
+    one, the listener fills a buffer of its own with the transforms of the robot. Bare frame names are the
+    robot's own. A context manager.
     """
 
     def __init__(
@@ -87,6 +89,11 @@ class CloudListener(PlacingListener[Cloud, PlacedCloud]):
         timeout_s: float = 1.0,
         clock: Clock | None = None,
     ) -> None:
+        if sensor == ANY and get_wire(wire).name == "ros2dds":
+            raise InvalidInput(
+                "the keys of ros2dds have no types, so that clouds are found by the name of their topic; "
+                "pass it: sensor='velodyne_points' for the topic /velodyne_points"
+            )
         super().__init__(
             session,
             robot,

@@ -28,8 +28,8 @@ _DAY_S = 86_400.0
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
 
 _UNKNOWN = (
-    "  the recorder did not end: the counts are of what it wrote until then; how many messages did not arrive, "
-    "and what followed, is not known"
+    "  the recorder did not end: the counts are of what it wrote until then; how many messages did not "
+    "arrive, and what followed, is not known"
 )
 
 
