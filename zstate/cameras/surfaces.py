@@ -160,7 +160,7 @@ def _shape_surfaces(shape: Shape, read_mesh: MeshReader) -> Iterator[Surface]:
             (real_numbers(points, "points"), np.asarray(triangles, dtype=np.intp), color)
             for points, triangles, color in read_mesh(geometry)
         ]
-        for corners, color in _simplified(parts):
+        for corners, color in simplified(parts):
             yield _placed(shape, corners, shape.color if color is None else color)
     else:
         yield _placed(shape, _primitive(geometry), shape.color)
@@ -218,10 +218,10 @@ def _steps(length: float) -> int:
     return min(max(round(length / _FACE_M), 1), _MOST_FACES)
 
 
-def _simplified(
+def simplified(
     parts: Sequence[tuple[Floats, NDArray[np.intp], Color | None]],
 ) -> list[tuple[Corners, Color | None]]:
-    """The faces of the parts of a mesh and their colours, as fine as the number of faces allows."""
+    """The faces of the parts of a mesh and their colours, as fine as 400 faces allow."""
     longest = max((float(np.ptp(points, axis=0).max()) for points, _, _ in parts if len(points)), default=0.0)
     faces: list[tuple[Corners, Color | None]] = []
     for steps in _MESH_STEPS if longest else ():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate import se3
+from zstate.cameras.surfaces import Corners, simplified
 from zstate.model.geometry import MeshFile, Shape
 from zstate.model.mesh_paths import MeshPaths, MissingFile
 from zstate.view.mesh_geometry import Mesh, directions, groups, primitive
@@ -27,7 +28,8 @@ class MeshEdges:
 
     ``ends`` (E, 2, 3) [m] are their points; ``faces`` (E, 2) the triangles beside each, the same one twice at
     a border. The plane of a triangle with the normal n and the distance d has the points n p = d: ``normals``
-    (F, 3) and ``distances`` (F,) [m].
+    (F, 3) and ``distances`` (F,) [m]. ``covers`` (C, 4, 3) [m] are the faces of the simplified meshes, which
+    hide what is behind them.
     """
 
     ends: Lines
@@ -35,6 +37,7 @@ class MeshEdges:
     normals: NDArray[np.float64]
     distances: NDArray[np.float64]
     is_sharp: NDArray[np.bool_]
+    covers: Corners
 
     def seen_from(self, eye: ArrayLike) -> Lines:
         """The outline and the sharp edges on the near side, as ``eye`` (3,) [m] sees them: (K, 2, 3)."""
@@ -62,7 +65,10 @@ def mesh_edges(points: NDArray[np.float64], triangles: NDArray[np.integer]) -> M
     cosines = np.einsum("ij,ij->i", normals[faces[:, 0]], normals[faces[:, 1]])
     is_sharp = (cosines < _SHARP) | (faces[:, 0] == faces[:, 1])
     distances = np.einsum("ij,ij->i", normals, corners[:, 0])
-    return MeshEdges(points[pairs[order[starts]]], faces, normals, distances, is_sharp)
+    covers = np.concatenate(
+        [np.zeros((0, 4, 3), np.float32), *(one for one, _ in simplified([(points, triangles, None)]))]
+    )
+    return MeshEdges(points[pairs[order[starts]]], faces, normals, distances, is_sharp, covers)
 
 
 class RobotEdges:

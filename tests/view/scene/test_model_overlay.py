@@ -19,7 +19,7 @@ from zstate.model.geometry import read_shapes
 from zstate.model.urdf import parse_urdf
 from zstate.transform import Transform
 from zstate.view.pictures import Packet, StillPicture
-from zstate.view.scene.model_overlay import ModelOverlay, segments_of, split
+from zstate.view.scene.model_overlay import ModelOverlay, seen_rows, split
 from zstate.view.scene.robot_meshes import RobotKind
 
 S = 1_000_000_000
@@ -79,6 +79,27 @@ def test_near_side_has_lines_around_it_and_none_within(overlay, buffer):
     assert distances.min() > 200 * 0.2 / 1.8 - 3
 
 
+@pytest.mark.parametrize(("depth", "is_hidden"), [(3.0, True), (1.5, False)])
+def test_lines_of_a_link_are_hidden_by_a_link_in_front_of_it(depth: float, is_hidden: bool):
+    """A small box on the axis of the lens, 1 m behind a large one, or in front of it."""
+    model = BOX.replace(
+        "</robot>",
+        """<link name="small"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>
+        <joint name="j" type="floating"><parent link="base"/><child link="small"/></joint></robot>""",
+    )
+    overlay = ModelOverlay()
+    overlay.load({"box": RobotKind(read_shapes(parse_urdf(model, "boxes.urdf"))[0], None)})
+    until(lambda: all(edges.is_loaded for edges in overlay._edges.values()))
+    buffer = TransformBuffer(60.0)
+    buffer.insert_static(Transform("lens", "box/base", (0.0, 0.0, 2.0), UNTURNED))
+    buffer.insert_static(Transform("lens", "box/small", (0.0, 0.0, depth), UNTURNED))
+    picture, problem = overlay.drawn_over(picture_at(0), CAMERA, buffer)
+    assert problem is None
+    distances = np.abs(green(picture) - (159.5, 119.5)).max(axis=1)
+    # The edges of the near face of the large box are 200 * 0.2 / 1.8 = 22 px from the middle.
+    assert (distances.min() > 200 * 0.2 / 1.8 - 3) == is_hidden
+
+
 def test_picture_without_poses_at_its_stamp_is_left_as_it_is_with_the_reason(overlay, buffer):
     picture = picture_at(5 * S)
     same, problem = overlay.drawn_over(picture, CAMERA, buffer)
@@ -128,7 +149,8 @@ def test_rows_of_a_rolling_shutter_have_instants_of_their_own(overlay, buffer):
 
 def segments_seen(camera: Camera, *ends: tuple[float, float, float]) -> np.ndarray:
     lines = split(np.array([ends]))
-    return segments_of(*camera.project(lines.reshape(-1, 3)), camera)
+    pixels, valid = camera.project(lines.reshape(-1, 3))
+    return pixels.reshape(-1, 2, 2)[seen_rows(pixels, valid, camera)]
 
 
 def test_long_line_is_bent_as_the_lens_bends_it():
