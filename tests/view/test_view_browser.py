@@ -321,9 +321,9 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
     ):
         shown = show_view(sessions[1], "rrbot")
         clouds = shown.view.scene.clouds
-        until(lambda: "rrbot" in shown.source.models)
+        until(lambda: "rrbot" in shown.source.models, PATIENCE_S)
         view_tab = open_tab(shown.page.url)
-        until(lambda: clouds.has_any)
+        until(lambda: clouds.has_any, PATIENCE_S)
         until_fitted(shown)
         snapshot = shown.source.snapshot()
         placed = snapshot.poses_in("rrbot/world")
@@ -339,7 +339,7 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
         until(is_drawn, PATIENCE_S)
         view_tab.save_screenshot("cloud")
         field(view_tab, "Draw clouds").click()
-        until(lambda: not clouds.is_on)
+        until(lambda: not clouds.is_on, PATIENCE_S)
         until(lambda: not is_drawn(), PATIENCE_S)
 
 
