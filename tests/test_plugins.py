@@ -18,7 +18,7 @@ from helpers.prometheus_text import collected, row
 from zstate import StreamListener, StreamPublisher, plugins
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.metrics.collectors import add_publishers, add_writers
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session
 from zstate.streams import Stream
 from zstate.wire.identity import WriterId

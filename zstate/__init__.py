@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from zstate.model.kinematics import Kinematics
     from zstate.model.load import load_model
     from zstate.model.robot import RobotModel
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.net.session import connect
     from zstate.nodes.clock import ClockPublisher, SimulatedClock
     from zstate.nodes.listener import TransformListener
@@ -124,7 +124,7 @@ _HOMES = {
     "TransformPublisher": "nodes.transform_publisher",
     "Twist": "transform",
     "connect": "net.session",
-    "discover": "net.presence",
+    "discover": "net.discovery",
     "kernel": "extension",
     "load_model": "model.load",
 }

@@ -16,7 +16,7 @@ from helpers.robots import RRBOT, STAMP, UPRIGHT
 from zstate.bridges.ros2 import Bridge
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import Received, subscribe

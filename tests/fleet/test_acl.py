@@ -23,8 +23,9 @@ from zstate import StatePublisher, StaticPublisher, Transform, TransformListener
 from zstate.errors import AccessDenied, InvalidInput, SecondWriter
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.router_config import access_text
+from zstate.net.discovery import discover_readers
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
-from zstate.net.presence import announce, discover_readers
+from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher

@@ -14,7 +14,7 @@ from helpers.tokens import current_tokens
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput, LookupFailed, SecondWriter
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener

@@ -220,7 +220,7 @@ def _completed_type(command: str, argument: click.Argument) -> Any:
 
 
 def _announced_names(ctx: click.Context, incomplete: str) -> Iterator[str]:
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
 
     with suppress(ZStateError), _opened_session(ctx) as session:  # the command reports errors
         robots = discover(session, _ROBOTS_WITHIN_S, wire=ctx.params.get("wire") or "native")

@@ -45,29 +45,6 @@ SETTINGS: dict[str, object] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
 }
 
-ROS_ROUTER: dict[str, object] = {
-    "mode": "router",
-    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
-    "routing": {"router": {"peers_failover_brokering": False}},
-    "timestamping": {"enabled": True},
-    # Many nodes start at once, and are busy with that for a while.
-    "queries_default_timeout": 600_000,
-    "transport": {
-        "unicast": {
-            "open_timeout": 60_000,
-            "accept_timeout": 60_000,
-            "accept_pending": 10_000,
-            "max_sessions": 10_000,
-        },
-        "link": {"tx": {"lease": 60_000, "keep_alive": 2}},
-        "shared_memory": {"enabled": False},
-    },
-}
-"""The settings of rmw_zenohd, except that it listens at tcp/[::]:7447, which is open to the network.
-
-ROS nodes are peers. They find each other through the router's gossip and exchange data directly; the router
-forwards between peers and clients.
-"""
 
 _ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
 _LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}

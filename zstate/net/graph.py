@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError, Unreachable
-from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
+from zstate.net.discovery import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
 from zstate.net.sites import NO_SITES, Sites, Thinning
 from zstate.net.status_monitor import StatusMonitor, WriterState

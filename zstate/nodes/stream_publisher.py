@@ -8,7 +8,7 @@ from typing import Any
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
-from zstate.nodes.sample_publisher import MeasurementPublisher
+from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.plugins import find_stream, stream_named
 from zstate.streams import Stream
 from zstate.wire.native import new_message

@@ -35,7 +35,7 @@ from zstate.errors import InvalidInput
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest
+from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.plugins import stream_named
@@ -54,6 +54,7 @@ from zstate.recording.decode import (
 from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
 from zstate.recording.joint_states import RecordedJointReader
+from zstate.recording.model_edges import ModelEdgeFilter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.transforms import EdgeEpochs, RecordedTransformIngest, children_of
 from zstate.streams import JOINT_STREAMS, StreamName

@@ -25,7 +25,8 @@ from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.model.pinocchio_solver import select_engine
 from zstate.net.config import ROUTER_ENDPOINT
-from zstate.net.presence import RobotInfo, announce, connections, discover
+from zstate.net.discovery import RobotInfo, connections, discover
+from zstate.net.presence import announce
 from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
 from zstate.net.security.connection_check import (
     check_all_tcp,

@@ -23,7 +23,7 @@ from zstate.ingest.counters import ListenerStats
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset, measure_offsets, unanswered
-from zstate.net.presence import RobotInfo, discover, discover_readers
+from zstate.net.discovery import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
 from zstate.net.sites import NO_SITES, Sites, discover_sites
 from zstate.net.status_monitor import StatusSubscriber

@@ -12,7 +12,7 @@ from zstate.cli.output.console import count_text
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
-    from zstate.net.presence import RobotInfo
+    from zstate.net.discovery import RobotInfo
     from zstate.streams import StreamName
 
 
