@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         LookupFailed,
         ModelError,
         NoData,
-        RecordingError,
         SecondWriter,
         Stale,
         UnknownFrame,
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from zstate.nodes.stream_listener import StreamListener
     from zstate.nodes.stream_publisher import StreamPublisher
     from zstate.nodes.transform_publisher import TransformPublisher
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder
     from zstate.recording.recording import Recording
     from zstate.sources import JointReading, JointStateListener, SineSource
@@ -111,6 +111,7 @@ _HOMES = {
     "PartialStatePublisher": "nodes.partial_publisher",
     "Recorder": "recording.recorder",
     "Recording": "recording.recording",
+    "RecordingError": "recording.errors",
     "RobotModel": "model.robot",
     "SimulatedClock": "nodes.clock",
     "SineSource": "sources",

@@ -28,7 +28,8 @@ from zstate.odometry import OdometryPublisher
 from zstate.odometry.messages import Odometry
 from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import covariance_matrix, from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import from_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 

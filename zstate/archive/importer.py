@@ -47,11 +47,12 @@ from zstate.archive.layout import (
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.tracks import JointTrack, PoseTrack
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.plugins import stream_named
 from zstate.recording.decode import DecodedMessage, DecodedRecording
+from zstate.recording.errors import RecordingError
 from zstate.recording.export import joint_columns
 from zstate.recording.joint_states import DELAYED_NS, RecordedJointReader
 from zstate.recording.reader import RecordingReader

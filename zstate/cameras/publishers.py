@@ -21,7 +21,7 @@ from zstate.nodes.static_publisher import ValuePublisher
 from zstate.plugins import stream_named
 from zstate.rate import RateReport
 from zstate.wire.keys import check_writer, full_name
-from zstate.wire.messages import renumbered
+from zstate.wire.measurements import renumbered
 
 _ENVELOPE_BYTES = 5_000
 """What a message has beside its picture, at most: names of 1024 characters of 4 bytes."""

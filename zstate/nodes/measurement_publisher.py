@@ -11,7 +11,7 @@ from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.plugins import is_named
 from zstate.streams import StampedMessage, StreamName
 from zstate.wire.keys import check_writer
-from zstate.wire.messages import renumbered
+from zstate.wire.measurements import renumbered
 
 
 class MeasurementPublisher(SamplePublisher):

@@ -11,7 +11,7 @@ from zstate.net.session import Session
 from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.plugins import find_stream, stream_named
 from zstate.streams import Stream
-from zstate.wire.native import new_message
+from zstate.wire.measurements import new_message
 
 
 class StreamPublisher(MeasurementPublisher):

@@ -21,14 +21,8 @@ from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
 from zstate.streams import StreamName
 from zstate.wire.json_form import JsonDecoder, carried_as_json
-from zstate.wire.messages import (
-    JointState,
-    Message,
-    RobotDescription,
-    StaticTransforms,
-    TransformSample,
-    with_field,
-)
+from zstate.wire.measurements import with_field
+from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.streams import (

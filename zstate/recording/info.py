@@ -17,7 +17,7 @@ from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
 from zstate.streams import StreamName
-from zstate.wire.messages import from_float32_block
+from zstate.wire.measurements import from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 
 from zstate.errors import InvalidInput
@@ -12,7 +13,11 @@ from zstate.wire.messages import (
     Edges,
     StaticTransforms,
     TransformSample,
-    select_edges,
+    WriterTransforms,
+    covariances_of,
+    order_digest,
+    poses_from_block,
+    to_block,
 )
 
 
@@ -58,3 +63,13 @@ class ModelEdgeFilter:
 
 def _rows_of(block: bytes, rows: list[int]) -> bytes:
     return b"".join(block[row * POSE_BYTES : (row + 1) * POSE_BYTES] for row in rows)
+
+
+def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> TransformSample:
+    """The ``rows`` of a sample of ``edges``."""
+    chosen = tuple(edges[row] for row in rows)
+    head = (sample.stamp, sample.seq, sample.session, order_digest(chosen))
+    poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
+    if covariances is None:
+        return TransformSample(*head, to_block(poses[rows]), chosen)
+    return WriterTransforms(*head, to_block(poses[rows]), chosen, to_block(covariances[rows]))

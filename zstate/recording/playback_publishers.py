@@ -26,11 +26,12 @@ from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
 from zstate.plugins import edge_streams, is_bulk, is_latched, is_measured, is_named, measured_streams
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, edges_with_more, static_key
-from zstate.recording.model_edges import ModelEdgeFilter
+from zstate.recording.model_edges import ModelEdgeFilter, select_edges
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import MODEL_WRITER, full_name
+from zstate.wire.measurements import renumbered, with_field
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -39,9 +40,6 @@ from zstate.wire.messages import (
     StampedMessage,
     StaticTransforms,
     TransformSample,
-    renumbered,
-    select_edges,
-    with_field,
 )
 from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire
