@@ -55,7 +55,9 @@ NEIGHBOURS = {
 }
 
 # The modules of the buffer that other packages may import.
-BUFFER_MODULES = {"buffer", "edge_rules", "feed", "frame_tree", "snapshot", "tracks"}
+BUFFER_MODULES = {
+    *("buffer", "edge_rules", "feed", "frame_tree", "joint_samples", "projection", "snapshot", "tracks")
+}
 
 HOMES = {
     "pinocchio": "model",

@@ -46,6 +46,7 @@ from zstate.archive.layout import (
 )
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.joint_samples import track_samples
 from zstate.buffer.tracks import JointTrack, PoseTrack
 from zstate.errors import InvalidInput
 from zstate.model.joint_history import JointHistory
@@ -341,7 +342,7 @@ class _RobotImport:
             if isinstance(track, JointTrack):
                 key = "" if track is robot else " ".join(track.model.joint_names)
                 present[PARTS if key else JOINTS, key] = ""
-                self._write_joints(key, track.samples(view, None, None))
+                self._write_joints(key, track_samples(track, view))
             else:
                 present |= {(EDGES, child): parent for parent, child in track.edges}
                 self._write_edges(track, view.kept_stamps(), view.kept_rows())

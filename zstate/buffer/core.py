@@ -31,10 +31,7 @@ from zstate.buffer.tracks import JointTrack, Track, TrackOwner
 from zstate.buffer.waiting import WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
-from zstate.errors import (
-    InsertRefused,
-    InvalidInput,
-)
+from zstate.errors import InsertRefused, InvalidInput
 from zstate.model.robot import RobotModel
 from zstate.transform import UPPER_TRIANGLE, Transform
 

@@ -18,12 +18,7 @@ from zstate.plugins import all_streams, edge_streams, find_stream, is_named, is_
 from zstate.streams import BULK_BYTES, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.messages import (
-    JointState,
-    Message,
-    check_edges,
-    check_size,
-)
+from zstate.wire.messages import JointState, Message, check_edges, check_size
 from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
 
 VERSION = 1
