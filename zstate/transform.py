@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from zstate import se3
-from zstate._util.format import html_table
 from zstate.checks import QUATERNION_TOLERANCE, check_names, real_numbers
 from zstate.clock import Clock, check_stamp, format_stamp
 from zstate.errors import FrameMismatch, InvalidInput, LibraryMissing, format_duration
@@ -437,6 +436,8 @@ class Transform(TransformFields):
         )
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_table  # noqa: PLC0415 - for notebooks alone
+
         rows = [
             ("translation xyz [m]", _vector_text(self.translation)),
             ("rotation xyzw", _vector_text(self.rotation)),

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from zstate._util.bounded import MAX_ENTRIES, BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.format import html_of_fields
 from zstate._util.refusals import Refusals
 
 _LOG = logging.getLogger("zstate")
@@ -38,6 +37,8 @@ class ListenerStats:
     off_clock: int = 0
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_of_fields  # noqa: PLC0415 - for notebooks alone
+
         return html_of_fields(self)
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
-from zstate._util.format import html_of_fields
+from zstate._util.html import html_of_fields
 from zstate.clock import SystemClock, wait_interruptible
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.ingest.counters import Counters
