@@ -32,6 +32,8 @@ FLOORS = (
     {"clock", "message"},
     {"streams"},
     {"se3", "rate", "plugins"},
+    {"other_plugins"},
+    {"stream_registry"},
     {"transform"},
     {"model", "buffer", "wire"},
     {"ingest"},

@@ -31,8 +31,8 @@ from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.plugins import own_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
+from zstate.stream_registry import own_streams
 from zstate.wire import keys
 from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import encode, encoding_of

@@ -18,8 +18,8 @@ from zstate.odometry.messages import (
     Velocity,
     with_full_names,
 )
-from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
+from zstate.stream_registry import stream_named
 from zstate.wire.measurements import covariance_matrix, from_float32_block, to_float32_block
 from zstate.wire.messages import (
     JointState,

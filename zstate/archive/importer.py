@@ -51,7 +51,6 @@ from zstate.buffer.tracks import JointTrack, PoseTrack
 from zstate.errors import InvalidInput
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
-from zstate.plugins import stream_named
 from zstate.recording.decode import DecodedMessage, DecodedRecording
 from zstate.recording.errors import RecordingError
 from zstate.recording.export import joint_columns
@@ -59,6 +58,7 @@ from zstate.recording.joint_states import DELAYED_NS, RecordedJointReader
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.recording.stream_export import plain_columns
+from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import encode, encoding_of

@@ -18,8 +18,8 @@ from zstate.net.writer import write_all
 from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.nodes.robot_writer import RobotWriter
 from zstate.nodes.static_publisher import ValuePublisher
-from zstate.plugins import stream_named
 from zstate.rate import RateReport
+from zstate.stream_registry import stream_named
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.measurements import renumbered
 

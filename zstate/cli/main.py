@@ -26,7 +26,8 @@ from zstate.cli.commands import SECTIONS, load_command, load_other_command, own_
 from zstate.cli.output import logs
 from zstate.cli.signals import Ending
 from zstate.errors import ZStateError
-from zstate.plugins import built_in_plugins, other_plugins
+from zstate.other_plugins import other_plugins
+from zstate.plugins import built_in_plugins
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem

@@ -25,7 +25,7 @@ from typing import Any
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.security.credentials import check_identity
 from zstate.net.user_config import user_config
-from zstate.plugins import all_streams, is_named, latched_streams, own_streams
+from zstate.stream_registry import all_streams, is_named, latched_streams, own_streams
 from zstate.wire.keys import (
     CLOCK_KEY,
     EDGE_TOKEN,

@@ -17,7 +17,7 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.fleet.acl import AclRoles, Rule, access_control, check_namespace
 from zstate.net.config import ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.credentials import Credentials
-from zstate.plugins import streams_where
+from zstate.stream_registry import streams_where
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY, check_robot, stream_expression
 

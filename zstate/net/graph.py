@@ -18,7 +18,7 @@ from zstate.net.discovery import RobotInfo, discover, discover_readers, discover
 from zstate.net.session import Session
 from zstate.net.sites import NO_SITES, Sites, Thinning
 from zstate.net.status_monitor import StatusMonitor, WriterState
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER

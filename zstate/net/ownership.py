@@ -24,7 +24,7 @@ from zstate.errors import MessageError, SecondWriter, format_duration
 from zstate.net.presence import confirmed_tokens
 from zstate.net.session import Session
 from zstate.net.streams import BULK_CAPACITY, Ring, to_serialized
-from zstate.plugins import edge_streams, is_bulk, is_measured, is_named
+from zstate.stream_registry import edge_streams, is_bulk, is_measured, is_named
 from zstate.streams import BULK_BYTES, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, stream_expression, stream_key

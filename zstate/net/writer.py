@@ -13,7 +13,7 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
-from zstate.plugins import is_bulk, stream_named
+from zstate.stream_registry import is_bulk, stream_named
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout

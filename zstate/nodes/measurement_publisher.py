@@ -8,7 +8,7 @@ from zstate.clock import Clock
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.nodes.sample_publisher import SamplePublisher
-from zstate.plugins import is_named
+from zstate.stream_registry import is_named
 from zstate.streams import StampedMessage, StreamName
 from zstate.wire.keys import check_writer
 from zstate.wire.measurements import renumbered

@@ -26,7 +26,7 @@ from zstate.net.sample_history import MAX_IN_FLIGHT, HistoryRequest
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.plugins import is_named
+from zstate.stream_registry import is_named
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, shortened, stream_from_key, stream_key

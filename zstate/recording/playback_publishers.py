@@ -24,9 +24,9 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
-from zstate.plugins import edge_streams, is_bulk, is_latched, is_measured, is_named, measured_streams
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, edges_with_more, static_key
 from zstate.recording.model_edges import ModelEdgeFilter, select_edges
+from zstate.stream_registry import edge_streams, is_bulk, is_latched, is_measured, is_named, measured_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder

@@ -26,12 +26,19 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.plugins import edge_streams, is_bulk, is_latched, is_named, latched_streams, measured_streams
 from zstate.rate import Rate
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.errors import RecordingError
 from zstate.recording.gap_counter import GapCounter
 from zstate.recording.mcap.writer import RecordingWriter
+from zstate.stream_registry import (
+    edge_streams,
+    is_bulk,
+    is_latched,
+    is_named,
+    latched_streams,
+    measured_streams,
+)
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, check_robot

@@ -38,7 +38,6 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
-from zstate.plugins import stream_named
 from zstate.recording.decode import (
     STREAMS,
     DecodedMessage,
@@ -57,6 +56,7 @@ from zstate.recording.joint_states import RecordedJointReader
 from zstate.recording.model_edges import ModelEdgeFilter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.transforms import EdgeEpochs, RecordedTransformIngest, children_of
+from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.message import Count, Message, SessionId, Stamp, StampedMessage
-from zstate.plugins import stream_named
+from zstate.stream_registry import stream_named
 from zstate.streams import KILOBYTE, SAMPLE_BYTES, StreamName
 from zstate.transform import COVARIANCE_NUMBERS
 

@@ -14,7 +14,7 @@ from typing import TypeVar
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
+from zstate.stream_registry import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
 from zstate.streams import BULK_BYTES, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId

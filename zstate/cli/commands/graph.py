@@ -81,7 +81,7 @@ def _discover_measured_graph(session: Session) -> Graph:
     from zstate.net.graph import build_graph
     from zstate.net.sites import discover_sites
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.plugins import edge_streams, measured_streams
+    from zstate.stream_registry import edge_streams, measured_streams
     from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
 

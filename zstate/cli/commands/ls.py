@@ -101,7 +101,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.net.discovery import discover
     from zstate.net.sites import discover_sites
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.plugins import streams_where
+    from zstate.stream_registry import streams_where
     from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:

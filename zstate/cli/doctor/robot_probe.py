@@ -31,7 +31,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
 from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
-from zstate.plugins import edge_streams, is_latched, is_measured, measured_streams, stream_named
+from zstate.stream_registry import edge_streams, is_latched, is_measured, measured_streams, stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY

@@ -187,10 +187,10 @@ def _export_stream(
     frame: str | None,
     overwrite: bool,
 ) -> None:
-    from zstate.plugins import stream_named
     from zstate.recording.errors import RecordingError
     from zstate.recording.recording import Recording
     from zstate.recording.stream_export import export_points, export_stream
+    from zstate.stream_registry import stream_named
 
     path = Path(output) if output else Path(file).with_suffix(f".{stream}.{kind}")
     with Recording(file, robot) as recording:
