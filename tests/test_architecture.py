@@ -32,7 +32,7 @@ FLOORS = (
     {"clock", "message"},
     {"streams"},
     {"se3", "rate", "plugins"},
-    {"other_plugins"},
+    {"covariance", "other_plugins"},
     {"stream_registry"},
     {"transform"},
     {"model", "buffer", "wire"},

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from zstate.checks import real_numbers
 from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.covariance import check_covariance
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.net.writer import write_all
@@ -29,7 +30,7 @@ from zstate.odometry.messages import (
     Velocity,
 )
 from zstate.streams import StreamName
-from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
+from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import to_block
 
