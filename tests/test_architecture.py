@@ -32,6 +32,8 @@ FLOORS = (
     {"clock", "message"},
     {"streams"},
     {"se3", "rate", "plugins"},
+    {"covariance", "other_plugins"},
+    {"stream_registry"},
     {"transform"},
     {"model", "buffer", "wire"},
     {"ingest"},
@@ -55,7 +57,9 @@ NEIGHBOURS = {
 }
 
 # The modules of the buffer that other packages may import.
-BUFFER_MODULES = {"buffer", "edge_rules", "feed", "frame_tree", "snapshot", "tracks"}
+BUFFER_MODULES = {
+    *("buffer", "edge_rules", "feed", "frame_tree", "joint_samples", "projection", "snapshot", "tracks")
+}
 
 HOMES = {
     "pinocchio": "model",

@@ -260,6 +260,9 @@ class BufferFeed:
         ``stamps`` (T,) [ns] ascend, at least one; ``poses`` are (T, 7) and ``covariances`` (T, 21), NaN if
         not known. Raises InsertRefused as ``insert_many``.
         """
+        if covariances is not None:
+            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 - here, not in a lookup later
+
         with self._lock:
             ((track, _),) = self._pose_tracks.track_rows((edge,), int(stamps[-1]), None)
             rows = poses

@@ -100,7 +100,7 @@ def archive_command(context: click.Context, *, url: str, recordings: tuple[str, 
 
 def _add(url: str, recordings: tuple[str, ...]) -> None:
     from zstate.archive.importer import import_recording
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
 
     failed: list[str] = []
     for recording in recordings:
@@ -183,7 +183,7 @@ def cut_command(
     zstate view minute.mcap
     """
     from zstate.archive.cut import cut
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
 
     if at is not None and start is None and end is None:
         start, end = at, at + _MINUTE_NS

@@ -160,7 +160,7 @@ def export_command(
         raise click.UsageError("--ply writes points: name their stream, such as --stream cloud")
     if rate is not None and stamps is not None:
         raise click.UsageError("--rate and --stamps exclude each other: both choose the rows")
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.export import Exporter
     from zstate.recording.recording import Recording
 
@@ -187,10 +187,10 @@ def _export_stream(
     frame: str | None,
     overwrite: bool,
 ) -> None:
-    from zstate.errors import RecordingError
-    from zstate.plugins import stream_named
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recording import Recording
     from zstate.recording.stream_export import export_points, export_stream
+    from zstate.stream_registry import stream_named
 
     path = Path(output) if output else Path(file).with_suffix(f".{stream}.{kind}")
     with Recording(file, robot) as recording:
@@ -213,7 +213,7 @@ def _export_stream(
 
 
 def _export_lerobot(names: Sequence[str], folder: str, fps: int, task: str, *, overwrite: bool) -> None:
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.lerobot import export_lerobot
 
     *others, last = names

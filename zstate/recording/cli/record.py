@@ -29,8 +29,8 @@ from zstate.recording.cli.metrics import recorder_rows
 
 if TYPE_CHECKING:
     from zstate.clock import Clock
-    from zstate.errors import RecordingError
     from zstate.metrics.endpoint import BindAddress
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder, RecorderStats
     from zstate.recording.retention import FilePattern, Keep, Retention
 
@@ -120,7 +120,7 @@ def record_command(
     zstate record run.mcap --wire ros2:domain=5 --split-size 500
     zstate record rec-%Y%m%d-%H%M%S.mcap --split-size 500 --keep 50GB
     """
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder
 
     pattern = _file_pattern(file)
