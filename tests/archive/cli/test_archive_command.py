@@ -10,6 +10,9 @@ from archive.test_archive import MIDNIGHT, tour
 from helpers.cli_runner import failure, run_cli
 from helpers.recording_builder import RecordingBuilder, S, swing_positions
 
+from zstate.recording.stores import opened_path
+from zstate.view.data_source import ViewSource
+
 
 def test_recordings_are_added_once_and_listed_by_robot(tmp_path: Path):
     url = str(tmp_path / "a")
@@ -44,6 +47,38 @@ def test_a_minute_of_the_archive_is_a_recording_for_all_other_commands(tmp_path:
     assert "26 joint_states" in run_cli("archive", url, "cut", half, "arm", *stamps).stdout.replace("\n", " ")
     assert "--from TIME --to TIME" in failure("archive", url, "cut", half, "arm", code=2)
     assert "no time like" in failure("archive", url, "cut", half, "arm", "--at", "noon", code=2)
+
+
+def test_commands_take_a_window_of_an_archive_where_they_take_a_file(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tour(tmp_path / "r.mcap", MIDNIGHT + 30 * S, MIDNIGHT + 31 * S)
+    assert run_cli("archive", "a", "--from", "r.mcap").code == 0
+    minute = ("--at", "2023-11-15T00:00")
+    assert run_cli("export", "a", "arm", "--csv", *minute).code == 0
+    assert run_cli("export", "r.mcap", "arm", "--csv").code == 0
+    assert (tmp_path / "arm.csv").read_text() == (tmp_path / "r.csv").read_text()
+    half = ("--from", "2023-11-15T00:00:30", "--to", str(MIDNIGHT + 30 * S + S // 2))
+    drawn = run_cli("plot", "arm", "--file", "a", *half).stdout
+    assert "wrote arm.png: 2 curves, 26 samples" in drawn
+    assert "no robot 'leg'" in failure("export", "a", "leg", "--csv", *minute)
+    assert "is an archive: name one robot" in failure("export", "a", "arm", "--csv")
+    assert "'r.mcap' is no archive" in failure("plot", "arm", "--file", "r.mcap", *minute)
+    assert "need --file" in failure("plot", "arm", *minute, code=2)
+    assert "--from TIME --to TIME" in failure("export", "a", "arm", "--csv", *minute, *half, code=2)
+
+
+def test_a_view_of_an_archive_has_the_robot_of_that_minute(tmp_path: Path):
+    tour(tmp_path / "r.mcap", MIDNIGHT + 30 * S, MIDNIGHT + 31 * S)
+    url = str(tmp_path / "a")
+    assert run_cli("archive", url, "--from", str(tmp_path / "r.mcap")).code == 0
+    with (
+        opened_path(url, "arm", (MIDNIGHT, MIDNIGHT + 60 * S)) as opened,
+        ViewSource.from_recording(opened.path) as source,
+    ):
+        assert source.robots() == ("arm",)
+        assert source.span.newest - source.span.oldest > 0.9 * S
+    assert not opened.path.exists()
+    assert "are for an archive" in failure("view", "arm", "--robot", "arm", code=2)
 
 
 def test_a_recording_that_cannot_be_added_is_named_and_the_others_are_in(tmp_path: Path):
