@@ -24,6 +24,15 @@ class ArchiveStore:
 
         cut(self._url, path, robot, start, end)
 
-    def arguments_to_add(self, path: Path) -> tuple[str, ...]:
-        """The arguments of `zstate` with which it adds the recording ``path``."""
-        return "archive", self._url, "--from", str(path)
+    def check(self) -> None:
+        """Raise LibraryMissing without pyarrow, and RecordingError for a URL that cannot be opened."""
+        from zstate.archive.files import Files  # noqa: PLC0415 - pyarrow takes time
+        from zstate.archive.storage import Store  # noqa: PLC0415
+
+        Files(Store(self._url)).imports()
+
+    def add(self, path: Path) -> None:
+        """Add the recording ``path``; raises as ``import_recording``."""
+        from zstate.archive.importer import import_recording  # noqa: PLC0415 - likewise
+
+        import_recording(self._url, path)

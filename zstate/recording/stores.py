@@ -5,7 +5,7 @@ A plugin brings one: its row ``store`` names a class like ``RecordingStore``.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -33,8 +33,12 @@ class RecordingStore(Protocol):
         """
         ...
 
-    def arguments_to_add(self, path: Path) -> Sequence[str]:
-        """The arguments of `zstate` with which it adds the recording ``path``; again, it adds nothing."""
+    def check(self) -> None:
+        """Raise a ZStateError if it cannot be used."""
+        ...
+
+    def add(self, path: Path) -> None:
+        """Add the recording ``path``; if it has it already, nothing is added. Raises a ZStateError."""
         ...
 
 
@@ -47,6 +51,13 @@ def store_types() -> list[type[RecordingStore]]:
 def find_store(name: str) -> RecordingStore | None:
     """The store ``name``; None if it is none, but perhaps a recording."""
     return next((kind(name) for kind in store_types() if kind.is_store(name)), None)
+
+
+def new_store(name: str) -> RecordingStore:
+    """The store ``name``, which may have no recording yet. Raises InvalidInput if no plugin brings one."""
+    for kind in store_types():
+        return kind(name)
+    raise InvalidInput(f"no plugin of zstate keeps recordings in {name!r}: `zstate plugins` lists them")
 
 
 class OpenedPath(NamedTuple):
