@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from numbers import Real
 from typing import TypeAlias
 
@@ -189,7 +190,7 @@ class BufferCore:
         covariance = transform.covariance
         triangle = None
         if covariance is not None:
-            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 - here, not in a lookup later
+            import_module("zstate.buffer.covariance_path")  # here, not in a lookup later
 
             triangle = covariance[UPPER_TRIANGLE][None]
         return self._insert_poses((edge,), transform.stamp, transform.pose7[None], triangle, writer)
