@@ -22,6 +22,7 @@ from zstate import StatePublisher, StaticPublisher, Transform, TransformListener
 from zstate.errors import InPast, Unreachable
 from zstate.fleet.router_config import RouterConfig
 from zstate.fleet.uplink import Uplink
+from zstate.ingest.diagnostics import WriterEvent
 from zstate.net.session import Session
 from zstate.net.sites import SiteAnnouncement, Thinning, discover_sites
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -214,6 +215,20 @@ def test_a_site_is_announced_with_its_robots_and_rates():
             assert sites.thinning("robot_0000", "robot_description") is None
             assert sites.thinning("other", "joint_states") is None
         assert discover_sites(session).robots == {}
+
+
+def test_a_silent_link_is_noticed_by_the_period_that_the_site_announces():
+    events: list[WriterEvent] = []
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        TransformListener(site.far, "r1", on_event=events.append) as far,
+        TransformListener(site.local, "r1") as near,
+        StatePublisher(site.local, RRBOT, "r1") as publisher,
+    ):
+        until(lambda: (publisher.publish([0.1, 0.2]), far.stats.received >= 3)[1], timeout_s=30.0)
+        assert near.stats.received > far.stats.received
+        until(lambda: any(one.kind == "stale" for one in events))
+        assert "or the link of its site is down" in next(one for one in events if one.kind == "stale").text
 
 
 def test_tools_at_headquarters_call_no_sample_lost_that_the_site_holds_back():

@@ -17,6 +17,7 @@ from zstate.ingest.stamp_checks import StampCheck
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
+from zstate.net.sites import SiteWatch
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.messages import Sample
@@ -50,10 +51,17 @@ class ListenerDiagnostics(Diagnostics, Closeable):
         streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._streams)
         self._events = EventLog(streams, follow, wire.shared, on_event)
         self._has_deadlines = on_event is not None
+        self._sites: SiteWatch | None = None
         if self._has_deadlines:
             self.on_usual_sample = self._events.on_sample
+            if not wire.shared:
+                self._sites = SiteWatch(
+                    session, thread, lambda sites: self._events.set_thinned(sites.periods_s(follow))
+                )
 
     def close(self) -> None:
+        if self._sites is not None:
+            self._sites.close()
         self._events.close()
 
     def events(self) -> tuple[WriterEvent, ...]:
