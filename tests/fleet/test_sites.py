@@ -8,18 +8,28 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 import zenoh
 from helpers.cli_runner import run_cli
+from helpers.fault_programs import ShiftedClock
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect
-from zstate.errors import InPast, Unreachable
+from zstate.errors import (
+    ClockMismatch,
+    Disconnected,
+    InFuture,
+    InPast,
+    NoData,
+    Stale,
+    UnknownFrame,
+    Unreachable,
+)
 from zstate.fleet.router_config import RouterConfig
 from zstate.fleet.uplink import Uplink
 from zstate.ingest.diagnostics import WriterEvent
@@ -202,6 +212,41 @@ def test_a_writer_without_a_cache_is_named_by_an_exact_lookup():
         until(lambda: (publisher.publish([0.1, 0.2]), far.buffer.can_lookup("base", "lower"))[1])
         with pytest.raises(Unreachable, match=r"which places 'r1/upper', has not sent its samples"):
             far.lookup("base", "lower", exact=True, timeout_s=0.3)
+
+
+def test_lookups_across_sites_are_refused_by_name_if_a_clock_is_off():
+    """r1 is 2 s ahead; both stand in one map. Within one robot lookups go on, and ages are corrected."""
+    ahead = ShiftedClock()
+    ahead.shift_ns = 2_000_000_000
+    with (
+        running_site(("r1", "r2"), {"joint_states": THIN_HZ, "transforms": THIN_HZ}) as site,
+        StatePublisher(site.local, RRBOT, "r1", clock=ahead) as off,
+        StatePublisher(site.local, RRBOT, "r2") as right,
+        StaticPublisher(site.local, "r1", "place") as place,
+        StaticPublisher(site.local, "r2", "place") as other_place,
+        TransformListener(site.far) as far,
+    ):
+        place.set(Transform("fleet/map", "r1/world", (0.0, 0.0, 0.0), UPRIGHT))
+        other_place.set(Transform("fleet/map", "r2/world", (5.0, 0.0, 0.0), UPRIGHT))
+
+        def mismatch() -> ClockMismatch | None:
+            for publisher in (off, right):
+                publisher.publish([0.1, 0.2])
+            with suppress(UnknownFrame, Disconnected, NoData, Stale, InPast, InFuture):
+                try:
+                    far.buffer.lookup("r1/lower", "r2/lower")
+                except ClockMismatch as error:
+                    return error
+            return None
+
+        until(lambda: mismatch() is not None, timeout_s=30.0)
+        error = mismatch()
+        assert error is not None
+        assert re.search(r"robot 'r1' is stamped in 'site plant1 \(\+2\.0 s\)' time", str(error))
+        until(lambda: (off.publish([0.1, 0.2]), far.buffer.can_lookup("fleet/map", "r1/lower"))[1])
+        with pytest.raises(Stale) as stale:
+            far.buffer.lookup("fleet/map", "r1/lower", max_age_s=0.0)
+        assert 0.0 < stale.value.age_s < 2.0
 
 
 def test_a_site_is_announced_with_its_robots_and_rates():

@@ -344,7 +344,12 @@ class TransformBuffer(BufferCore):
             raise
         if query.max_age_s is None:
             return transform
-        if path.domain not in ("", self.clock.domain):
+        ahead_s = 0.0
+        if path.domain in ("", self.clock.domain):
+            pass
+        elif (ahead_ns := self._tree.domain.ahead_ns(path.domain)) is not None:
+            ahead_s = ahead_ns * 1e-9
+        else:
             edge, names, domains = (
                 path.uses[0].edge,
                 (path.target, path.source),
@@ -352,11 +357,11 @@ class TransformBuffer(BufferCore):
             )
             robot = self._tree.domain.robot_placing(edge[1])
             raise ClockMismatch(*names, edges=(edge,), robots=(robot,), domains=domains)
-        if path.uses and transform.age(self.clock) > query.max_age_s:
+        if path.uses and transform.age(self.clock) + ahead_s > query.max_age_s:
             # Once more, of samples that the error describes.
             views = path.views()
             transform = path.transform_in(views, query.at, query.predict_ns)
-            age_s = transform.age(self.clock)
+            age_s = transform.age(self.clock) + ahead_s
             if age_s > query.max_age_s:
                 raise path.stale(views, transform.stamp, age_s, query.max_age_s)
         return transform
