@@ -44,6 +44,7 @@ from zstate.model.joint_history import JointHistory
 from zstate.transform import Transform, Twist
 
 if TYPE_CHECKING:
+    from zstate.buffer.interpolation_bound import InterpolationBound
     from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader
 
 S = TypeVar("S")
@@ -238,6 +239,18 @@ class TransformBuffer(BufferCore):
         query = self._query(reference, frame, at)
         motion, stamp = self._path(reference, frame).motion(query.at)
         return Twist(frame, reference, motion.linear, motion.angular, stamp)
+
+    def interpolation_bound(self, target: str, source: str, at: int | None = None) -> InterpolationBound:
+        """How far the pose that ``lookup`` returns can be from the true one, by joint velocity limits.
+
+        Samples that arrive thinned are interpolated over long intervals. Raises as ``lookup``.
+        """
+        from zstate.buffer.interpolation_bound import interpolation_bound  # noqa: PLC0415 - for few programs
+
+        stamp = self.lookup(target, source, at).stamp
+        with self._lock:
+            to_target, to_source, *_ = self._tree.path(target, source)
+        return interpolation_bound((*to_target, *to_source), 0 if stamp is None else stamp)
 
     def latest(self, target: str, source: str) -> int:
         """The newest stamp [ns] that every moving edge between the frames has reached.
