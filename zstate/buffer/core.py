@@ -15,7 +15,8 @@ from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.feed import BufferFeed
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreePath
-from zstate.buffer.history import HistoryView, insert_together, keep_only_around
+from zstate.buffer.history import insert_together, keep_only_around
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.path import TransformPath, compile_path
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, TrackOwner
@@ -191,7 +192,8 @@ class BufferCore:
         covariance = transform.covariance
         triangle = None
         if covariance is not None:
-            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 - here, not in a lookup later
+            # Loaded here, so that no lookup has to.
+            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 # pyright: ignore[reportUnusedImport]
 
             triangle = covariance[UPPER_TRIANGLE][None]
         return self._insert_poses((edge,), transform.stamp, transform.pose7[None], triangle, writer)

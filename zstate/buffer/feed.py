@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree, TreeSnapshot
-from zstate.buffer.history import FastPath, History, HistoryView, merged
+from zstate.buffer.history import FastPath, History, merged
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, checked_rows
 from zstate.buffer.tracks import ClockOffsets, JointTrack, PoseTrack, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
@@ -261,7 +262,8 @@ class BufferFeed:
         not known. Raises InsertRefused as ``insert_many``.
         """
         if covariances is not None:
-            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 - here, not in a lookup later
+            # Loaded here, so that no lookup has to.
+            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 # pyright: ignore[reportUnusedImport]
 
         with self._lock:
             ((track, _),) = self._pose_tracks.track_rows((edge,), int(stamps[-1]), None)

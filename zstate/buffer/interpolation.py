@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate import se3
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.model.joint_transforms import JointTransform
 from zstate.se3 import Backend, Component, Pose, Vector
 

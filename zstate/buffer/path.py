@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from zstate import se3
 from zstate.buffer.frame_tree import Edge, TreePath
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.interpolation import (
     ContinuousAngleInterpolator,
     Interpolator,

@@ -10,7 +10,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.history import History, HistoryView
+from zstate.buffer.history import History
+from zstate.buffer.history_view import HistoryView
 from zstate.clock import ClockOffset
 from zstate.errors import InsertRefused
 from zstate.model.joint_transforms import JointTransform, shared_transforms

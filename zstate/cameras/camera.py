@@ -30,7 +30,9 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer import projection  # noqa: F401 - loaded before a loop calls ``TransformBuffer.project``
+
+# Loaded here, so that no loop loads it that calls ``TransformBuffer.project``.
+from zstate.buffer import projection  # noqa: F401 # pyright: ignore[reportUnusedImport]
 from zstate.cameras.messages import CameraInfo, CameraModel
 from zstate.checks import check_names, check_points, real_numbers, reduced_to_fields
 from zstate.errors import InvalidInput
