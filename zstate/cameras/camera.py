@@ -30,7 +30,6 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-
 # Loaded here, so that no loop loads it that calls ``TransformBuffer.project``.
 from zstate.buffer import projection  # noqa: F401 # pyright: ignore[reportUnusedImport]
 from zstate.cameras.messages import CameraInfo, CameraModel
