@@ -14,7 +14,8 @@ from zstate.buffer.history import History
 from zstate.buffer.history_view import HistoryView
 from zstate.clock import ClockOffset
 from zstate.errors import InsertRefused
-from zstate.model.joint_transforms import JointTransform, shared_transforms
+from zstate.model.joint_forms import JointTransform
+from zstate.model.joint_transforms import shared_transforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 from zstate.transform import COVARIANCE_NUMBERS
