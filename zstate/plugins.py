@@ -56,6 +56,8 @@ class Plugin:
       ``zstate.cli.doctor.plugin_checks.PluginChecks``.
     - ``metrics``: of zstate itself, ``"module:class"`` of what `zstate monitor --metrics` serves of its
       streams, a subclass of ``zstate.cli.metrics.PluginMetrics``.
+    - ``store``: of zstate itself, ``"module:class"`` of what keeps recordings other than as files, a
+      ``zstate.recording.stores.RecordingStore``.
     - ``needs``: of zstate itself, the folders of other plugins without which it does not work.
     """
 
@@ -65,6 +67,7 @@ class Plugin:
     synonyms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     checks: str = ""
     metrics: str = ""
+    store: str = ""
     needs: tuple[str, ...] = ()
 
     def command(self, name: str) -> Command:

@@ -132,15 +132,16 @@ class TransformBuffer(BufferCore):
         """
         if max_age_s is None and timeout_s == 0.0 and predict_s == 0.0:
             try:
-                cached = self._paths.get((target, source))
-            except TypeError:  # of a list, which has no hash and is no name
-                cached = None
-            if cached is not None and cached[0] == self._tree.version:
-                transform = cached[1].at(at)
-                if transform is not None:
-                    return transform
-                if not self._stop_reason:
-                    cached[1].raise_if_outside(at)
+                version, find, path, _ = self._paths[target, source]
+            except (KeyError, TypeError):  # TypeError of a list, which has no hash and is no name
+                pass
+            else:
+                if version == self._tree.version:
+                    transform = find(at)
+                    if transform is not None:
+                        return transform
+                    if not self._stop_reason:
+                        path.raise_if_outside(at)
         query = self._query(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
         if check_duration("timeout_s", timeout_s) > 0.0 and not self._stop_reason:
             return self._wait(query, timeout_s)
@@ -344,7 +345,7 @@ class TransformBuffer(BufferCore):
 
     def _lookup(self, query: Query) -> Transform:
         try:
-            path = self._cached_path(query.target, query.source).path
+            path = self._cached_path(query.target, query.source)[2]
             transform = path.transform(query.at, query.predict_ns)
         except LookupFailed as reason:
             self._complete(reason, query.at)
@@ -387,7 +388,7 @@ class TransformBuffer(BufferCore):
         """The newest transform, with ``waiter`` expecting a newer one; else as ``_lookup_or_expect``."""
         version = self._tree.version
         try:
-            _, path, dependencies = self._cached_path(query.target, query.source)
+            *_, path, dependencies = self._cached_path(query.target, query.source)
             transform = path.at(None) or path.transform(None)
         except LookupFailed as reason:
             return self._expect_change(query, reason, waiter, version)
@@ -406,7 +407,7 @@ class TransformBuffer(BufferCore):
                 condition = WakeCondition(self._tree.dependencies(query.target, query.source))
         else:
             with suppress(LookupFailed):  # the tree has changed since, which its version shows
-                _, path, dependencies = self._cached_path(query.target, query.source)
+                *_, path, dependencies = self._cached_path(query.target, query.source)
                 condition = WakeCondition(dependencies, _required_stamps(query, reason, path), query.at)
         waiter.expect(condition, version)
         if _is_final(query, reason, condition):

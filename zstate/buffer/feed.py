@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
+from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
@@ -262,8 +263,7 @@ class BufferFeed:
         not known. Raises InsertRefused as ``insert_many``.
         """
         if covariances is not None:
-            # Loaded here, so that no lookup has to.
-            from zstate.buffer import covariance_path  # noqa: F401, PLC0415 # pyright: ignore[reportUnusedImport]
+            import_module("zstate.buffer.covariance_path")  # here, not in a lookup later
 
         with self._lock:
             ((track, _),) = self._pose_tracks.track_rows((edge,), int(stamps[-1]), None)

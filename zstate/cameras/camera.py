@@ -24,19 +24,20 @@ import math
 import operator
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import Any, get_args
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-# Loaded here, so that no loop loads it that calls ``TransformBuffer.project``.
-from zstate.buffer import projection  # noqa: F401 # pyright: ignore[reportUnusedImport]
 from zstate.cameras.messages import CameraInfo, CameraModel
 from zstate.checks import check_names, check_points, real_numbers, reduced_to_fields
 from zstate.errors import InvalidInput
 from zstate.wire.keys import full_name
 from zstate.wire.messages import from_block, to_block
+
+import_module("zstate.buffer.projection")  # before a loop calls ``TransformBuffer.project``
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

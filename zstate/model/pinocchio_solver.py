@@ -40,7 +40,7 @@ _COMMANDS = {
 class Engine(NamedTuple):
     """What computes a publisher's transforms: "Pinocchio 4.1.0", or "closed forms".
 
-    For closed forms ``reason`` describes why, and ``command`` mends it.
+    For closed forms in place of Pinocchio ``reason`` describes why, and ``command`` mends it.
     """
 
     name: str

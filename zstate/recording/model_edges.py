@@ -47,6 +47,10 @@ class ModelEdgeFilter:
         edges = tuple(statics.edges[row] for row in rows)
         return StaticTransforms(statics.session, edges, _rows_of(statics.poses, rows))
 
+    def removes_all(self, robot: str, edges: Edges) -> bool:
+        """Whether known models define all of ``edges``, of which nothing is left then."""
+        return not self._kept(robot, edges)
+
     def _kept(self, robot: str, edges: Edges) -> list[int]:
         rows = self._rows.get((robot, edges))
         if rows is None:
