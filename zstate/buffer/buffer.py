@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.tf2_methods import with_tf2_methods
 from zstate.buffer.core import BufferCore
 from zstate.buffer.feed import BufferFeed
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.path import TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.tracks import JointTrack, TimeSpan, Track

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree, TreeSnapshot
-from zstate.buffer.history import FastPath, History, HistoryView, merged
+from zstate.buffer.history import FastPath, History, merged
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, checked_rows
 from zstate.buffer.tracks import ClockOffsets, JointTrack, PoseTrack, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
