@@ -15,7 +15,7 @@ from zstate.errors import Closed, InvalidInput
 from zstate.model.kinematics import Kinematics, MovingEdges
 from zstate.model.load import load_model
 from zstate.model.pinocchio_solver import select_engine
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import connect
 from zstate.nodes import moving_edges
 from zstate.nodes.partial_publisher import PartialStatePublisher

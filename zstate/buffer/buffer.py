@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.other_names import with_tf2_methods
+from zstate._util.tf2_methods import with_tf2_methods
 from zstate.buffer.core import BufferCore
 from zstate.buffer.feed import BufferFeed
 from zstate.buffer.history import HistoryView
-from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
-from zstate.buffer.projection import ProjectingCamera, project_rows
+from zstate.buffer.path import TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.tracks import JointTrack, TimeSpan, Track
-from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
+from zstate.buffer.waiting import RequiredStamps, Waiter, WakeCondition
 from zstate.checks import Points, check_names, check_points
 from zstate.clock import Clock, check_stamp, check_stamps, check_stamps_of_points, wait_interruptible
 from zstate.errors import (
@@ -40,11 +39,15 @@ from zstate.errors import (
     UnknownFrame,
     as_timeout,
 )
-from zstate.model.joint_history import JointHistory
 from zstate.transform import Transform, Twist
 
 if TYPE_CHECKING:
+    from zstate.buffer.message_filter import MessageFilter
+    from zstate.buffer.plan import Plan
+    from zstate.buffer.projection import ProjectingCamera
     from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader
+    from zstate.buffer.watch import TransformWatch
+    from zstate.model.joint_history import JointHistory
 
 S = TypeVar("S")
 
@@ -217,6 +220,8 @@ class TransformBuffer(BufferCore):
         Points that the camera does not see, without a transform at their instant, or that are not finite,
         are NaN and not valid. Raises as ``place`` does.
         """
+        from zstate.buffer.projection import project_rows  # noqa: PLC0415 - cameras load it
+
         path = self._path(camera.frame, frame)
         array = check_points(points).astype(np.float64, copy=False)  # as float32 it would be 1e-4 px
 
@@ -227,6 +232,8 @@ class TransformBuffer(BufferCore):
 
     def plan(self, target: str, source: str) -> Plan:
         """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""
+        from zstate.buffer.plan import Plan  # noqa: PLC0415 - of the loops that have one
+
         return Plan(target, source, self._tree, lambda: self._path(target, source))
 
     def twist(self, frame: str, reference: str, at: int | None = None) -> Twist:
@@ -422,6 +429,8 @@ class TransformBuffer(BufferCore):
         has moved or rotated so far since the last call. The frames need not exist yet. The callback runs on
         the thread that inserts: keep it short.
         """
+        from zstate.buffer.watch import TransformWatch  # noqa: PLC0415 - lookups do without
+
         if self._stop_reason:
             raise Closed(self._stop_reason)
         lookup_newest = partial(self._lookup_newest, self._query(target, source, None))
@@ -444,6 +453,8 @@ class TransformBuffer(BufferCore):
         ``timeout_s`` is left out and counted by its error in ``dropped``; one whose frame or stamp cannot be
         any raises InvalidInput.
         """
+        from zstate.buffer.message_filter import MessageFilter  # noqa: PLC0415 - lookups do without
+
         check_names(target)
         check_duration("timeout_s", timeout_s)
         return MessageFilter(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
@@ -477,8 +488,10 @@ class TransformBuffer(BufferCore):
         samples around it. The joints of the other drivers are interpolated as in lookups; their velocities
         are NaN. Raises InvalidInput as ``joint_positions``.
         """
+        from zstate.buffer.joint_samples import robot_samples  # noqa: PLC0415 - lookups read no samples
+
         start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
-        return self._robot_joints(self._robot_track(robot)).samples(start, end)
+        return robot_samples(self._robot_joints(self._robot_track(robot)), start, end)
 
     def link_poses(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of a robot at a stamp, and that stamp: (L, 7), rows as the ``links`` of its model.

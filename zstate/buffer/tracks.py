@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
 from zstate.errors import InsertRefused
-from zstate.model.joint_history import JointHistory
 from zstate.model.joint_transforms import JointTransform, shared_transforms
 from zstate.model.kinematics import Kinematics
-from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.model.robot import RobotModel
 from zstate.transform import COVARIANCE_NUMBERS
 
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
@@ -152,23 +151,6 @@ class JointTrack:
         if velocities is None:
             velocities = np.full(self.model.velocity_count, np.nan)
         return np.concatenate((positions, velocities))
-
-    def samples(self, view: HistoryView, start: int | None, end: int | None) -> JointHistory:
-        """Copies of the samples in ``view`` with stamps in [start, end) [ns]; None is no limit."""
-        coordinates = coordinate_names(self.model)
-        stamps = view.kept_stamps()
-        first = 0 if start is None else int(stamps.searchsorted(start))
-        last = len(stamps) if end is None else int(stamps.searchsorted(end))
-        rows = view.kept_rows()[first:last].copy()
-        positions, velocities = rows[:, : self.position_count], rows[:, self.position_count :]
-        return JointHistory(
-            self.model.joint_names,
-            coordinates,
-            tuple(coordinates[column] for column in velocity_columns_by_position(self.model)),
-            stamps[first:last].copy(),
-            positions,
-            None if np.isnan(velocities).all() else velocities,
-        )
 
 
 class PoseTrack:

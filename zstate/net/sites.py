@@ -14,7 +14,7 @@ from zstate._util.closeable import Closeable
 from zstate.errors import InvalidInput
 from zstate.net.presence import announce, confirmed_tokens
 from zstate.net.session import Session
-from zstate.plugins import find_stream
+from zstate.stream_registry import find_stream
 from zstate.streams import StreamName
 from zstate.wire.keys import SITE_TOKEN
 
