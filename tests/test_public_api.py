@@ -81,6 +81,7 @@ SIGNATURES = {
     "Transform.from_se3": "(target, source, placement, stamp=None)",
     "Transform.from_rpy": "(target, source, translation, rpy, stamp=None)",
     "TransformBuffer": "(history_s=10.0, clock=None)",
+    "TransformBuffer.interpolation_bound": "(target, source, at=None)",
     "TransformBuffer.add_robot": "(model, prefix='')",
     "TransformBuffer.remove_robot": "(track)",
     "TransformBuffer.insert_joints": "(track, stamp, positions, velocities=None)",

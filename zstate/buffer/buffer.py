@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.tf2_methods import with_tf2_methods
 from zstate.buffer.core import BufferCore
 from zstate.buffer.feed import BufferFeed
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.path import TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.tracks import JointTrack, TimeSpan, Track
@@ -42,6 +42,7 @@ from zstate.errors import (
 from zstate.transform import Transform, Twist
 
 if TYPE_CHECKING:
+    from zstate.buffer.interpolation_bound import InterpolationBound
     from zstate.buffer.message_filter import MessageFilter
     from zstate.buffer.plan import Plan
     from zstate.buffer.projection import ProjectingCamera
@@ -247,6 +248,18 @@ class TransformBuffer(BufferCore):
         motion, stamp = self._path(reference, frame).motion(query.at)
         return Twist(frame, reference, motion.linear, motion.angular, stamp)
 
+    def interpolation_bound(self, target: str, source: str, at: int | None = None) -> InterpolationBound:
+        """How far the pose that ``lookup`` returns can be from the true one, by joint velocity limits.
+
+        Samples that arrive thinned are interpolated over long intervals. Raises as ``lookup``.
+        """
+        from zstate.buffer.interpolation_bound import interpolation_bound  # noqa: PLC0415 - for few programs
+
+        stamp = self.lookup(target, source, at).stamp
+        with self._lock:
+            to_target, to_source, *_ = self._tree.path(target, source)
+        return interpolation_bound((*to_target, *to_source), 0 if stamp is None else stamp)
+
     def latest(self, target: str, source: str) -> int:
         """The newest stamp [ns] that every moving edge between the frames has reached.
 
@@ -352,7 +365,12 @@ class TransformBuffer(BufferCore):
             raise
         if query.max_age_s is None:
             return transform
-        if path.domain not in ("", self.clock.domain):
+        ahead_s = 0.0
+        if path.domain in ("", self.clock.domain):
+            pass
+        elif (ahead_ns := self._tree.domain.ahead_ns(path.domain)) is not None:
+            ahead_s = ahead_ns * 1e-9
+        else:
             edge, names, domains = (
                 path.uses[0].edge,
                 (path.target, path.source),
@@ -360,11 +378,11 @@ class TransformBuffer(BufferCore):
             )
             robot = self._tree.domain.robot_placing(edge[1])
             raise ClockMismatch(*names, edges=(edge,), robots=(robot,), domains=domains)
-        if path.uses and transform.age(self.clock) > query.max_age_s:
+        if path.uses and transform.age(self.clock) + ahead_s > query.max_age_s:
             # Once more, of samples that the error describes.
             views = path.views()
             transform = path.transform_in(views, query.at, query.predict_ns)
-            age_s = transform.age(self.clock)
+            age_s = transform.age(self.clock) + ahead_s
             if age_s > query.max_age_s:
                 raise path.stale(views, transform.stamp, age_s, query.max_age_s)
         return transform

@@ -16,7 +16,8 @@ from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.feed import BufferFeed
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreePath
-from zstate.buffer.history import HistoryView, insert_together, keep_only_around
+from zstate.buffer.history import insert_together, keep_only_around
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.path import TransformPath, compile_path
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, TrackOwner

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree, TreeSnapshot
-from zstate.buffer.history import FastPath, History, HistoryView, merged
+from zstate.buffer.history import FastPath, History, merged
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, checked_rows
 from zstate.buffer.tracks import ClockOffsets, JointTrack, PoseTrack, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
@@ -125,8 +126,15 @@ class BufferFeed:
 
     def set_domain(self, robot: str, domain: str) -> bool:
         """Set the clock ``domain`` that stamps the samples of ``robot``. Returns whether that is a change."""
+        return self._note_domain(lambda: self.domain.set(robot, domain))
+
+    def set_measured_domain(self, robot: str, domain: str, ahead_ns: int = 0) -> bool:
+        """``ClockDomain.set_measured``."""
+        return self._note_domain(lambda: self.domain.set_measured(robot, domain, ahead_ns))
+
+    def _note_domain(self, change: Callable[[], bool]) -> bool:
         with self._lock:
-            changed = self.domain.set(robot, domain)
+            changed = change()
             if changed:
                 self._tree.version += 1
         if changed:

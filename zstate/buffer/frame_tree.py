@@ -309,7 +309,7 @@ class FrameTree:
 
     def domain_of(self, edge: Edge) -> str | None:
         """The clock domain of the samples of a moving edge: that of the robot whose writer places it."""
-        return self.domain.domain_of(self.robot_of(edge))
+        return self.domain.comparable(self.robot_of(edge))
 
     def frame_info(self, name: str) -> FrameInfo:
         """The facts about one frame that is in the tree."""

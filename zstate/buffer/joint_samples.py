@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.tracks import JointTrack
 from zstate.model.joint_history import JointHistory

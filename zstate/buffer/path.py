@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from zstate import se3
 from zstate.buffer.frame_tree import Edge, TreePath
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.interpolation import (
     ContinuousAngleInterpolator,
     Interpolator,
@@ -40,7 +40,7 @@ from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
 from zstate.checks import Points
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
-from zstate.model.joint_transforms import JointTransform
+from zstate.model.joint_forms import JointTransform
 from zstate.transform import Kind, Transform
 
 if TYPE_CHECKING or kernel == "c":

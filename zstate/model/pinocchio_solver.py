@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from zstate.checks import Floats
 from zstate.errors import LibraryMissing
 from zstate.extension import kernel
-from zstate.model.joint_transforms import JointTransform
+from zstate.model.joint_forms import JointTransform
 from zstate.model.robot import RobotModel
 
 if TYPE_CHECKING or kernel == "c":

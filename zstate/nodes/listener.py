@@ -57,7 +57,8 @@ class TransformListener(Closeable):
     /tf_static but those of a model, which robot_state_publisher repeats. A context manager.
 
     The clock domain of each robot is the one in its description, and robots of different domains may share
-    the buffer; a lookup across two of them raises ClockMismatch. Input that cannot be used is counted in
+    the buffer; a lookup across two of them raises ClockMismatch. So does one to a robot of a site whose clock
+    is more than 0.1 s off, as measured. Input that cannot be used is counted in
     ``stats``, logged once through ``logging``, and never stops the stream.
 
     In a forked process nothing fills the buffer: it answers from the samples it has, waits end at once, and

@@ -10,13 +10,16 @@ import threading
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.checks import Floats
 from zstate.errors import ModelError
 from zstate.model.kinematics import MovingEdges
-from zstate.model.pinocchio_solver import Engine
 from zstate.model.robot import RobotModel
+
+if TYPE_CHECKING:
+    from zstate.model.pinocchio_solver import Engine
 
 _LOG = logging.getLogger("zstate")
 

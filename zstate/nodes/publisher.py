@@ -12,8 +12,8 @@ from zstate._util.fork_safe import fork_safe
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
+from zstate.model.joint_forms import edge_forms
 from zstate.model.joint_limits import JointLimits
-from zstate.model.joint_transforms import edge_forms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.net.session import Session
 from zstate.net.writer import SampleWriter, write_all
