@@ -27,7 +27,7 @@ MEASURED = (
         f"zstate/{name}.py"
         for name in ("__init__", "__main__", "checks", "clock", "errors", "extension", "message")
     ),
-    *(f"zstate/{name}.py" for name in ("plugins", "rate", "se3", "streams", "transform")),
+    *(f"zstate/{name}.py" for name in ("plugins", "rate", "se3", "stream_registry", "streams", "transform")),
     "setup.py",
     "bench/subjects",
     "bench/worker.py",

@@ -144,7 +144,7 @@ class ModelError(ZStateError, ValueError):
 
 
 class UnknownModel(ModelError):
-    """No file, URDF text or catalog entry has that name."""
+    """No file, URDF text or catalog entry has that ``name``; ``near_misses`` are similar ones, best first."""
 
     def __init__(self, name: str, near_misses: Sequence[str], message: str) -> None:
         super().__init__(name, (), message)
@@ -315,8 +315,9 @@ class LookupFailed(ZStateError):
 class UnknownFrame(LookupFailed):
     """A frame that no model, static edge or sample has named so far.
 
-    ``near_misses`` are searched when they are first read, because the search takes milliseconds among
-    thousands of frames. They are chosen among the frames of the moment when this was raised.
+    ``name`` is that of the frame, and ``frame_count`` the number of frames that are known. ``near_misses``
+    are searched when they are first read, because the search takes milliseconds among thousands of frames,
+    and are chosen among the frames of the moment when this was raised.
     """
 
     def __init__(
@@ -372,7 +373,7 @@ class UnknownFrame(LookupFailed):
 
 
 class AmbiguousFrame(LookupFailed):
-    """A bare frame name that more than one robot has."""
+    """A bare frame ``name`` that more than one robot has; ``candidates`` are the full names."""
 
     def __init__(self, target: str, source: str, *, name: str, candidates: Sequence[str]) -> None:
         super().__init__(target, source)

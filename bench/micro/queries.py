@@ -19,7 +19,7 @@ from zstate.net.clock_offset import measure_offsets
 from zstate.net.session import Session
 
 CACHE_S = 2.0
-LOOK_BACK_NS = 1_900_000_000
+LOOK_BACK_NS = 1_000_000_000
 GIVE_UP_S = 10.0
 
 
@@ -41,21 +41,21 @@ def rows(session: Session, robot: str, times: int) -> Iterator[Row]:
     selector = f"zstate/{robot}/lookup?target={ends[0]};source={ends[1]}"
 
     def join() -> None:
-        """Open a listener until it has history; the cache holds 0.1 s more than is looked up."""
+        """Open a listener until it has history; the cache holds 1 s more than is looked up."""
         begin, stamp = time.monotonic(), time.time_ns() - LOOK_BACK_NS
         with TransformListener(session, robot) as listener:
             listener.buffer.wait(*ends, timeout_s=10.0)
             while not listener.buffer.can_lookup(*ends, stamp):
                 if time.monotonic() > begin + GIVE_UP_S:
                     raise SystemExit(
-                        f"no history from 1.9 s back within {GIVE_UP_S:g} s: the machine is too busy"
+                        f"no history from 1 s back within {GIVE_UP_S:g} s: the machine is too busy"
                     )
                 time.sleep(0.0005)
 
     def query() -> None:
         assert [reply.ok.payload for reply in session.zenoh.get(selector)]
 
-    yield Row("listener opened to an answer 1.9 s back", "ms", [elapsed_ms(join) for _ in range(times)])
+    yield Row("listener opened to an answer 1 s back", "ms", [elapsed_ms(join) for _ in range(times)])
     yield Row("lookup by one query", "ms", [elapsed_ms(query) for _ in range(times)])
     offsets = [measure_offsets(session, robot)[0] for _ in range(times)]
     yield Row("error of the clock offset", "us", [abs(one.offset_ns) * 1e-3 for one in offsets])

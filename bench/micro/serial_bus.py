@@ -49,7 +49,7 @@ def measure(
 def drive(path: Path, servos: int, rate_hz: float, seconds: float) -> Iterator[Row]:
     """Runs a host and a commander."""
     joints = tuple(f"joint{number}" for number in range(1, servos + 1))
-    driver = SerialServos(str(path), joints, range(1, servos + 1), latency_ms=0)
+    driver = SerialServos(str(path), joints, list(range(1, servos + 1)), latency_ms=0)
     options = {"rate_hz": rate_hz, "faults_allowed": PATIENCE, "following_error": 1.0}
     ended = threading.Event()
     with (

@@ -230,7 +230,7 @@ def main() -> None:
     bus = ServoBus(arguments.path, arguments.servos, arguments.noise)
     signals: list[int] = []
     signal.signal(signal.SIGUSR1, lambda number, _: signals.append(number))
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    signal.signal(signal.SIGTERM, lambda _number, _frame: sys.exit())
     bus.plug()
     print(f"{arguments.servos} servos at {arguments.path}; kill -USR1 {os.getpid()} unplugs them", flush=True)
     try:

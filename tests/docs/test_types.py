@@ -1,11 +1,13 @@
-"""Programs of the pages pass mypy --strict, and pyright in strict mode."""
+"""Programs of the pages, notebooks and example drivers pass mypy --strict, and pyright in strict mode."""
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -35,7 +37,17 @@ zstate.driving.Commandr(pose)  # type: ignore[attr-defined]
 buffer.lookup_transform("map", "base")  # type: ignore[attr-defined]
 '''
 
-UNTYPED = ("pandas", "pinocchio", "scipy.spatial.transform")
+UNTYPED = (
+    "IPython.display",
+    "dynamixel_sdk",
+    "matplotlib.pyplot",
+    "mujoco",
+    "pandas",
+    "pinocchio",
+    "rtde_control",
+    "rtde_receive",
+    "scipy.spatial.transform",
+)
 """Modules without types, of which checkers know nothing or guess: they are Any here, which a stub says."""
 
 
@@ -49,6 +61,30 @@ def write_programs(folder: Path) -> list[Path]:
     for name, text in found.items():
         (folder / name).write_text(text)
     return [folder / name for name in sorted(found)]
+
+
+def write_drivers(folder: Path) -> None:
+    """The example drivers."""
+    for path in (ROOT / "models/drivers").glob("*.py"):
+        (folder / path.name).write_text(path.read_text())
+
+
+def write_notebooks(folder: Path) -> None:
+    """The code of each notebook as an async function, as cells may await."""
+    for path in (DOCS / "notebooks").glob("*.ipynb"):
+        cells = [one for one in json.loads(path.read_text())["cells"] if one["cell_type"] == "code"]
+        code = "\n".join(displayed("".join(one["source"])) for one in cells)
+        text = f"async def notebook() -> None:\n{textwrap.indent(code, '    ')}"
+        (folder / f"notebook_{path.stem}.py").write_text(text)
+
+
+def displayed(cell: str) -> str:
+    """The cell with its value, that of a last expression, printed."""
+    last = ast.parse(cell).body[-1]
+    if not isinstance(last, ast.Expr):
+        return cell
+    lines = cell.splitlines()
+    return "\n".join((*lines[: last.lineno - 1], f"print({ast.unparse(last)})"))
 
 
 def write_stubs(folder: Path) -> None:
@@ -67,6 +103,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     project = tmp_path_factory.mktemp("programs")
     names = {path.name for path in write_programs(project)}
     assert {"guides_lookup_poses.py", "readme_pose.py", "tutorial_swing.py"} <= names
+    write_drivers(project)
+    write_notebooks(project)
+    assert {"can_motors.py", "notebook_live_lookups.py"} <= {path.name for path in project.glob("*.py")}
     (project / "claims.py").write_text(CLAIMS)
     write_stubs(project / "typings")
     return project
@@ -79,13 +118,13 @@ def check(folder: Path, module: str, *arguments: str) -> None:
 
 
 @pytest.mark.long
-def test_programs_of_the_pages_pass_mypy_strict(folder: Path) -> None:
+def test_programs_notebooks_and_drivers_pass_mypy_strict(folder: Path) -> None:
     (folder / "mypy.ini").write_text("[mypy]\nstrict = True\nmypy_path = typings\nexclude = typings/\n")
     check(folder, "mypy", "--cache-dir", os.devnull, ".")
 
 
 @pytest.mark.long
-def test_programs_of_the_pages_pass_pyright_strict(folder: Path) -> None:
+def test_programs_notebooks_and_drivers_pass_pyright_strict(folder: Path) -> None:
     settings = {
         "exclude": ["typings"],
         "typeCheckingMode": "strict",

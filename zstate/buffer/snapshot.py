@@ -70,10 +70,12 @@ class FrameTable:
     def tracks_of(self) -> Mapping[str, tuple[Track, ...]]:
         """The tracks on which the place of each robot depends, by name.
 
-        That of its joints, or without a model those of the edges to its frames, ``robot/frame``; then those
+        Those of its joints, or without a model those of the edges to its frames, ``robot/frame``; then those
         of the edges above. A moving edge below a link of its model is not among them.
         """
-        found: dict[str, dict[Track, None]] = {name: {track: None} for name, track in self.robots.items()}
+        found: dict[str, dict[Track, None]] = {
+            name: dict.fromkeys((track, *track.parts.values())) for name, track in self.robots.items()
+        }
         roots = {track.frame(track.model.root): name for name, track in self.robots.items()}
         for row, name in enumerate(self.names):
             prefix, separator, _ = name.partition("/")

@@ -10,6 +10,7 @@ import pytest
 from helpers.robots import SECOND, UPRIGHT
 
 from zstate import Transform, TransformBuffer, load_model
+from zstate.buffer.buffer import feed_of
 from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.net.graph import Graph, StreamUse
 from zstate.net.status_monitor import WriterState
@@ -97,6 +98,19 @@ def test_state_is_the_rate_of_the_joint_states_or_of_transforms():
     assert state_text("cam", tree, is_live=True) == "live, 5.0 Hz, transforms only"
     assert state_text("cam", tree, is_live=False) == "in the past, 5.0 Hz, transforms only"
     assert state_text("driver", tree, is_live=True) == "no model yet"
+
+
+def test_state_is_that_of_the_parts_if_other_writers_move_all_joints():
+    """As on the ROS 2 wire, where a state publisher has the model, and a driver the joint states."""
+    buffer = TransformBuffer()
+    robot, feed = buffer.add_robot(load_model("rrbot"), "rrbot"), feed_of(buffer)
+    part = feed.add_part(robot, robot.model.joint_names)
+    feed.assign_joints(robot, dict.fromkeys(robot.model.joint_names, part))
+    for tick in range(3):
+        buffer.insert_joints(part, tick * SECOND // 20, [0.0, 0.0])
+    tree = buffer.frame_table()
+    assert state_text("rrbot", tree, is_live=True) == "live, 20.0 Hz"
+    assert stale_reason("rrbot", tree, {part: "silent for 4 s"}) == "silent for 4 s"
 
 
 def test_robot_is_stale_if_a_writer_that_places_it_is():

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 
 from zstate.buffer.snapshot import FramePoses, FrameTable
-from zstate.buffer.tracks import PoseTrack, Track
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track
 from zstate.clock import SYSTEM
 from zstate.errors import LookupFailed, format_duration
 from zstate.ingest.deadline import is_stale
@@ -179,8 +179,13 @@ def stale_reason(robot: str, tree: FrameTable, silent: Mapping[Track, str]) -> s
     if not stale or (robot not in tree.robots and len(stale) < len(tracks)):
         return None
     first = stale[0]
-    is_above = robot in tree.robots and first is not tree.robots[robot]
+    is_above = robot in tree.robots and first not in _joint_tracks(tree.robots[robot])
     return f"its place: {silent[first]}" if is_above else silent[first]
+
+
+def _joint_tracks(robot: JointTrack) -> tuple[JointTrack, ...]:
+    """The robot's own track, and those of its parts, which other writers move."""
+    return robot, *robot.parts.values()
 
 
 def state_text(robot: str, tree: FrameTable, *, is_live: bool) -> str:
@@ -188,7 +193,7 @@ def state_text(robot: str, tree: FrameTable, *, is_live: bool) -> str:
     joints, tracks = tree.robots.get(robot), tree.tracks_of.get(robot, ())
     if not tracks:
         return "no model yet"
-    expected = tracks if joints is None or not joints.model.joint_names else (joints,)
+    expected = tracks if joints is None or not joints.model.joint_names else _joint_tracks(joints)
     rates = [track.rate_hz for track in expected if track.rate_hz is not None]
     text = f"{'live' if is_live else 'in the past'}, {rates[0]:.1f} Hz" if rates else "no sample yet"
     return text if joints is not None else f"{text}, transforms only"
