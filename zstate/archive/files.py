@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,19 @@ from zstate.archive.layout import (
     IMPORTS,
     SUFFIX,
     check_version,
-    date_of,
+    cuts_by_date,
     folder_of,
     value_of,
 )
 from zstate.archive.storage import Store, arrow
 
 Stamps = NDArray[np.int64]
+T = TypeVar("T")
+R = TypeVar("R")
+
+_THREADS = 8
+_ROWS_FOR_THREADS = 100_000
+"""Rows of one file of which several columns are decoded at once."""
 
 
 class Entry(NamedTuple):
@@ -76,12 +83,16 @@ class Files:
             self._records[name] = tuple(Entry(name, *(row[field] for field in known)) for row in rows)
         return self._records[name]
 
+    def records(self, names: Sequence[str]) -> list[Entry]:
+        """The files of all these imports."""
+        return [one for entries in in_threads(self.record, names) for one in entries]
+
     def table(self, path: str) -> Any:
         """A table that fits into memory, a pyarrow.Table."""
         with self.store.opened(path) as file:
             opened = arrow().parquet.ParquetFile(file, page_checksum_verification=True)
             check_version(opened.metadata.metadata, self.store.where(path))
-            return opened.read()
+            return opened.read(use_threads=False)
 
     def dates(self, stream: str, robot: str) -> list[str]:
         """The dates with samples of a robot."""
@@ -89,8 +100,7 @@ class Files:
 
     def around(self, robot: str, streams: Iterable[str], stamps: Stamps) -> list[Entry]:
         """All files of the imports with files on the dates of ascending ``stamps``, or next to these."""
-        days = np.unique(stamps // (86_400 * 10**9)).tolist()
-        wanted = np.array([date_of(int(day) * 86_400 * 10**9) for day in days])
+        wanted = np.array([day for day, _ in cuts_by_date(stamps)])
         names: set[str] = set()
         for stream in streams:
             dates = np.array(self.dates(stream, robot), str)
@@ -99,7 +109,7 @@ class Files:
             for number in sorted(one for one in chosen if 0 <= one < len(dates)):
                 files = self.store.names(folder_of(stream, robot, str(dates[number])))
                 names |= {file.partition(".")[0] for file in files if file.endswith(SUFFIX)}
-        return [one for name in sorted(names) for one in self.record(name) if one.robot == robot]
+        return [one for one in self.records(sorted(names)) if one.robot == robot]
 
     def groups(self, entries: Sequence[Entry], stamps: Stamps, *, between: bool) -> list[Groups]:
         """The row groups of files of one key with the samples around each of ascending ``stamps``.
@@ -110,8 +120,7 @@ class Files:
         entries = [entries[number] for number in chosen]
         spans: list[tuple[int, int]] = []
         places: list[tuple[int, int]] = []
-        for number, entry in enumerate(entries):
-            footer = self.footer(entry)
+        for number, footer in enumerate(in_threads(self.footer, entries)):
             column = footer.schema.names.index("stamp")
             for group in range(footer.num_row_groups):
                 statistics = footer.row_group(group).column(column).statistics
@@ -137,15 +146,25 @@ class Files:
             self._footers[entry.path] = footer
         return self._footers[entry.path]
 
+    def read_all(self, groups: Sequence[Groups], columns: Sequence[str] | None = None) -> list[Any]:
+        """The rows of each of ``groups``."""
+        return in_threads(lambda one: self.read(one, columns), groups)
+
     def read(self, groups: Groups, columns: Sequence[str] | None = None) -> Any:
         """The rows of ``groups``, a pyarrow.Table; of ``columns`` those that the file has."""
         footer = self.footer(groups.entry)
         with self.store.opened(groups.entry.path) as file:
-            opened = arrow().parquet.ParquetFile(file, metadata=footer, page_checksum_verification=True)
+            opened = arrow().parquet.ParquetFile(
+                file,
+                metadata=footer,
+                page_checksum_verification=True,
+                pre_buffer=not self.store.is_local,  # then one request reads what is close together
+            )
             if columns is not None:
                 known = opened.schema_arrow.names
                 columns = [name for name in columns if name in known]
-            return opened.read_row_groups(groups.numbers, columns=columns)
+            is_large = groups.rows >= _ROWS_FOR_THREADS
+            return opened.read_row_groups(groups.numbers, columns=columns, use_threads=is_large)
 
 
 def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) -> list[int]:
@@ -153,20 +172,35 @@ def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) 
     if not spans or not len(stamps):
         return []
     firsts, lasts = np.array(spans, np.int64).T
+    starts, ends = stamps.searchsorted(firsts), stamps.searchsorted(lasts, "right")
     if between:
         is_needed = (firsts <= stamps[-1]) & (lasts >= stamps[0])
-        stamps = stamps[[0, -1]]
+        alone = stamps[[0, -1]]
     else:
-        is_needed = stamps.searchsorted(firsts) < stamps.searchsorted(lasts, "right")
+        is_needed, alone = starts < ends, stamps
     by_first, by_last = np.argsort(firsts, kind="stable"), np.argsort(lasts, kind="stable")
     overlap = (firsts[by_first][1:] <= np.maximum.accumulate(lasts[by_first])[:-1]).any()
-    alone = stamps
-    if not overlap:
-        place = firsts[by_first].searchsorted(stamps, "right") - 1
-        inside = (place >= 0) & (stamps <= lasts[by_first][place])
-        alone = stamps[~inside]
+    if not overlap and not between:  # stamps inside of a span need no other one
+        gaps = zip([0, *ends[by_first].tolist()], [*starts[by_first].tolist(), len(stamps)], strict=True)
+        alone = np.concatenate([stamps[start:end] for start, end in gaps])
+    elif not overlap:
+        place = firsts[by_first].searchsorted(alone, "right") - 1
+        inside = (place >= 0) & (alone <= lasts[by_first][place])
+        alone = alone[~inside]
     before = lasts[by_last].searchsorted(alone, "right") - 1
     after = firsts[by_first].searchsorted(alone)
     is_needed[by_last[before[before >= 0]]] = True
     is_needed[by_first[after[after < len(firsts)]]] = True
     return np.flatnonzero(is_needed).tolist()
+
+
+def in_threads(call: Callable[[T], R], arguments: Sequence[T]) -> list[R]:
+    """The results of ``call`` for each argument, in their order.
+
+    Several are computed at once: an object store takes a while for each file, and Parquet is decoded without
+    the lock of the interpreter.
+    """
+    if len(arguments) < 2:
+        return [call(one) for one in arguments]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return list(pool.map(call, arguments))
