@@ -285,7 +285,7 @@ class Archive:
         return [name.removesuffix(SUFFIX) for name in names]
 
     def _check_robot(self, robot: str) -> None:
-        if not set(self._imports_of(robot)).intersection(self._files.imports()):
+        if not any(map(self._files.is_complete, self._imports_of(robot))):
             known = ", ".join(map(repr, self.robots())) or "none"
             raise InvalidInput(f"the archive {self.url!r} has no robot {robot!r}; its robots: {known}")
 

@@ -72,20 +72,24 @@ class Files:
         """The names of all complete imports."""
         return [name.removesuffix(SUFFIX) for name in self.store.names(folder_of(IMPORTS))]
 
+    def is_complete(self, name: str) -> bool:
+        """Whether the import ``name`` is complete."""
+        return self.store.has(f"{folder_of(IMPORTS)}/{name}{SUFFIX}")
+
     def record(self, name: str) -> tuple[Entry, ...]:
         """The files of the import ``name``; none if it is not complete."""
         if name not in self._records:
-            path = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
-            if not self.store.has(path):
+            if not self.is_complete(name):
                 return ()
-            rows = self.table(path).to_pylist()
+            rows = self.table(f"{folder_of(IMPORTS)}/{name}{SUFFIX}").to_pylist()
             known = Entry._fields[1:]
             self._records[name] = tuple(Entry(name, *(row[field] for field in known)) for row in rows)
         return self._records[name]
 
     def records(self, names: Sequence[str]) -> list[Entry]:
         """The files of all these imports."""
-        return [one for entries in in_threads(self.record, names) for one in entries]
+        in_threads(self.record, [name for name in names if name not in self._records])
+        return [one for name in names for one in self.record(name)]
 
     def table(self, path: str) -> Any:
         """A table that fits into memory, a pyarrow.Table."""
@@ -120,7 +124,9 @@ class Files:
         entries = [entries[number] for number in chosen]
         spans: list[tuple[int, int]] = []
         places: list[tuple[int, int]] = []
-        for number, footer in enumerate(in_threads(self.footer, entries)):
+        in_threads(self.footer, [one for one in entries if one.path not in self._footers])
+        for number, entry in enumerate(entries):
+            footer = self.footer(entry)
             column = footer.schema.names.index("stamp")
             for group in range(footer.num_row_groups):
                 statistics = footer.row_group(group).column(column).statistics
