@@ -38,7 +38,7 @@ SIGNATURES = {
     "StatePublisher": (
         "(session, model, robot=None, wires=('native',), *, "
         "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='', "
-        "takeover=False, cache_s=2.0)"
+        "takeover=False, cache_s=2.0, pinocchio_on_demand=False)"
     ),
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",
@@ -81,6 +81,7 @@ SIGNATURES = {
     "Transform.from_se3": "(target, source, placement, stamp=None)",
     "Transform.from_rpy": "(target, source, translation, rpy, stamp=None)",
     "TransformBuffer": "(history_s=10.0, clock=None)",
+    "TransformBuffer.interpolation_bound": "(target, source, at=None)",
     "TransformBuffer.add_robot": "(model, prefix='')",
     "TransformBuffer.remove_robot": "(track)",
     "TransformBuffer.insert_joints": "(track, stamp, positions, velocities=None)",

@@ -23,9 +23,10 @@ from recording.test_recording import wild
 from zstate import Archive, Recording, Transform, UnknownFrame
 from zstate.archive import import_recording
 from zstate.archive.cut import cut
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
 from zstate.odometry.messages import Imu
 from zstate.recording.decode import DecodedMessage
+from zstate.recording.errors import RecordingError
 from zstate.wire.messages import to_block
 
 DAY = 86_400 * S

@@ -19,7 +19,8 @@ from zstate import Archive, Recording
 from zstate.archive import import_recording
 from zstate.archive.storage import Store
 from zstate.archive.upkeep import check, expire, forget
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.recording.errors import RecordingError
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import closing
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,17 @@ from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
-from zstate.fleet.acl import AclRoles, access_control, read_access_control
-from zstate.fleet.router_config import Downsampling, RouterConfig, Uplink, access_text
+from zstate.fleet.acl import ALL_KEYS, AclRoles, access_control, read_access_control
+from zstate.fleet.downsampling import Downsampling
+from zstate.fleet.router_config import RouterConfig, access_text
+from zstate.fleet.uplink import Uplink
 from zstate.net.config import default_config
 from zstate.net.security.credentials import Credentials
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.plugins import all_streams
+from zstate.stream_registry import all_streams
 from zstate.transform import Transform
-from zstate.wire.keys import MODEL_WRITER, stream_expression
+from zstate.wire import keys as wire_keys
+from zstate.wire.keys import MODEL_WRITER, stream_key
 
 FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
 CONFIGURATIONS = {
@@ -202,30 +205,54 @@ def uplink(rates_hz: dict[str, float], robots: tuple[str, ...] = ("r1", "r2"), *
     return Uplink("plant1", ("tls/hq.example.com:7447",), rates_hz, robots, **options)
 
 
-def test_a_stream_that_passes_has_a_rule_for_each_robot_and_any_other_one_for_all():
-    """Of a key that matches two rules Zenoh takes either, another one in each run: no two rules intersect."""
-    (item,) = uplink({"joint_states": 5.0, "tf": 0.0}).settings(())["downsampling"]
-    rates = {rule["key_expr"]: rule["freq"] for rule in item["rules"]}
-    passing = {key for key, rate in rates.items() if rate}
-    assert passing == {"zstate/r1/joint_states", "zstate/r2/joint_states"}
-    sampled = {stream_expression("*", row.name) for row in all_streams() if row.is_sampled}
-    assert rates.keys() - passing == sampled - {"zstate/*/joint_states"}
-    keys = [zenoh.KeyExpr(key) for key in rates]
-    assert not any(one.intersects(other) for one, other in combinations(keys, 2))
+def leaving(link: Uplink) -> list[zenoh.KeyExpr]:
+    """The keys whose samples and values leave."""
+    section: Any = link.settings((), {})["access_control"]
+    (rule,) = [one for one in section["rules"] if one["id"] == "leaves"]
+    assert rule["flows"] == ["egress"]
+    return [zenoh.KeyExpr(key) for key in rule["key_exprs"]]
+
+
+def test_of_samples_only_those_of_named_robots_and_streams_leave():
+    """By access control, which allows what one rule includes; of two rules that thin, Zenoh takes either."""
+    link = uplink({"joint_states": 5.0, "tf": 0.0})
+    keys = leaving(link)
+    for row in all_streams():
+        for robot in ("r1", "other"):
+            key = stream_key(robot, row.name, "name" if row.named else "")
+            passes = not row.is_sampled or (row.name == "joint_states" and robot == "r1")
+            assert any(one.includes(key) for one in keys) == passes, key
+    assert not any(one.includes("zstate/r1/of_another_package/name") for one in keys)
+    (item,) = link.settings((), {})["downsampling"]
+    assert {rule["key_expr"] for rule in item["rules"]} == {f"zstate/{r}/joint_states" for r in ("r1", "r2")}
+
+
+def test_within_the_site_all_keys_are_allowed():
+    keys = [zenoh.KeyExpr(key) for key in ALL_KEYS]
+    forms = [one.form for one in vars(wire_keys).values() if isinstance(one, wire_keys.Key)]
+    others = (
+        "0/chatter/dds/hash",
+        "zstate/r1/tf_static/m/@adv/pub/zid/1/_",
+        "@/zid/router/linkstate/routers",
+        "@ros2_lv/0/zid/0/0/NN/%/%/node",
+        "@/zid/@ros2_lv/MP/tf/type/qos",
+    )
+    for key in (*(re.sub("<[a-z]+>", "name", form) for form in forms), *others):
+        assert any(one.includes(key) for one in keys), key
 
 
 def test_a_sample_that_comes_a_little_early_passes_too():
     """At 5 of 50 Hz every tenth sample passes if it comes up to 8 ms early, and no ninth does."""
-    rules = uplink({"joint_states": 5.0}).settings(())["downsampling"][0]["rules"]
+    rules = uplink({"joint_states": 5.0}).settings((), {})["downsampling"][0]["rules"]
     least_s = 1.0 / rules[0]["freq"]
     assert 9 / 50 < least_s == pytest.approx(10 / 50 - 0.008)
 
 
 def test_the_uplink_is_told_by_protocol_or_by_interface():
-    assert uplink({}).settings(("tcp/127.0.0.1:7447",))["qos/network"][0]["link_protocols"] == ["tls"]
+    assert uplink({}).settings(("tcp/127.0.0.1:7447",), {})["qos/network"][0]["link_protocols"] == ["tls"]
     with pytest.raises(ConfigError, match=r"cannot be distinguished from 'tls/\[::\]:7447'.*--wan"):
-        uplink({}).settings(("tls/[::]:7447",))
-    item = uplink({}, interfaces=("wwan0",)).settings(("tls/[::]:7447",))["downsampling"][0]
+        uplink({}).settings(("tls/[::]:7447",), {})
+    item = uplink({}, interfaces=("wwan0",)).settings(("tls/[::]:7447",), {})["qos/network"][0]
     assert item["interfaces"] == ["wwan0"]
     assert "link_protocols" not in item
 

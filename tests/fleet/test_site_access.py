@@ -12,7 +12,8 @@ from helpers.robots import RRBOT, SampleCollector
 from zstate import StatePublisher, connect, discover
 from zstate.errors import InvalidInput
 from zstate.fleet.acl import AclRoles, access_control
-from zstate.fleet.router_config import RouterConfig, Uplink
+from zstate.fleet.router_config import RouterConfig
+from zstate.fleet.uplink import Uplink
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session
 from zstate.net.sites import SiteAnnouncement, discover_sites

@@ -8,18 +8,31 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
+import zenoh
 from helpers.cli_runner import run_cli
+from helpers.fault_programs import ShiftedClock
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect
-from zstate.errors import InPast, Unreachable
-from zstate.fleet.router_config import RouterConfig, Uplink
+from zstate.errors import (
+    ClockMismatch,
+    Disconnected,
+    InFuture,
+    InPast,
+    NoData,
+    Stale,
+    UnknownFrame,
+    Unreachable,
+)
+from zstate.fleet.router_config import RouterConfig
+from zstate.fleet.uplink import Uplink
+from zstate.ingest.diagnostics import WriterEvent
 from zstate.net.session import Session
 from zstate.net.sites import SiteAnnouncement, Thinning, discover_sites
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -39,13 +52,13 @@ class Site(NamedTuple):
 
 
 @contextmanager
-def running_site(robots: tuple[str, ...], rates_hz: dict[str, float]) -> Iterator[Site]:
+def running_site(robots: tuple[str, ...], rates_hz: dict[str, float], **options: Any) -> Iterator[Site]:
     """The programs of a site use a socket file, so the uplink is distinguished from it by its protocol."""
     headquarters = f"tcp/127.0.0.1:{find_free_port()}"
     with ExitStack() as opened:
         folder = opened.enter_context(tempfile.TemporaryDirectory())
         site = f"unixsock-stream/{Path(folder) / 'site.sock'}"
-        link = Uplink("plant1", (headquarters,), rates_hz, robots)
+        link = Uplink("plant1", (headquarters,), rates_hz, robots, **options)
         opened.enter_context(connect(RouterConfig((headquarters,)).settings()))
         router = opened.enter_context(connect(RouterConfig((site,), uplink=link).settings()))
         opened.enter_context(SiteAnnouncement(router, link.site, link.rates_hz, robots))
@@ -90,6 +103,57 @@ def test_headquarters_receives_each_robot_at_the_named_rate_and_the_site_everyth
             passed, sent = len(far[name].arrivals), len(near[name].arrivals)
             # One tick in ten; on a busy machine ticks are late together, and more of them pass.
             assert sent / passed == pytest.approx(RATE_HZ / THIN_HZ, rel=0.3)
+
+
+@pytest.mark.parametrize("interfaces", [(), ("lo",)])
+def test_no_sample_leaves_of_a_robot_that_is_not_named(interfaces: tuple[str, ...]):
+    """All links of headquarters are on "lo" here, and the programs of the site use a socket file."""
+    robots = ("r1", "r2")
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}, interfaces=interfaces) as site,
+        published(site.local, robots),
+    ):
+        far, near = (
+            {name: SampleCollector(session, f"zstate/{name}/joint_states") for name in robots}
+            for session in (site.far, site.local)
+        )
+        until(lambda: len(far["r1"].arrivals) >= 5 and len(near["r2"].arrivals) >= 50, timeout_s=30.0)
+        assert not far["r2"].arrivals
+        with TransformListener(site.far, "*", history_on_join=False) as listener:
+            until(lambda: listener.buffer.can_lookup("r1/base", "r1/lower"))
+
+
+def lengths(session: Session, key: str) -> set[int]:
+    """Of the replies to a query."""
+    replies = session.zenoh.get(key, consolidation=zenoh.ConsolidationMode.NONE, timeout=5.0)
+    return {len(one.ok.payload.to_bytes()) for one in replies if one.ok is not None}
+
+
+def test_nothing_that_is_larger_than_the_limit_leaves_but_models_do():
+    """Samples, values and replies to late joiners alike."""
+    limit = 1000
+    sizes = (limit + 1, limit)
+    keys = ("zstate/r1/image/camera", "zstate/r1/map/floor", "zstate/r1/robot_description")
+    with running_site(("r1",), {"image": 10_000.0}, largest_bytes=limit) as site:
+        taps = {key: SampleCollector(site.far, key) for key in keys}
+
+        def put_all() -> bool:
+            for key in keys:
+                for size in sizes:
+                    site.local.zenoh.put(key, bytes(size))
+            return min(len(one.arrivals) for one in taps.values()) >= 5
+
+        until(put_all)
+        found = {key: {len(payload) for payload in tap.payloads(5)} for key, tap in taps.items()}
+        assert found == {keys[0]: {limit}, keys[1]: {limit}, keys[2]: set(sizes)}
+
+        def reply(query: zenoh.Query) -> None:
+            for size in sizes:
+                query.reply(query.key_expr, bytes(size))
+
+        with site.local.zenoh.declare_queryable("zstate/r1/map/a", reply):
+            until(lambda: lengths(site.far, "zstate/r1/map/a") == {limit})
+            assert lengths(site.local, "zstate/r1/map/a") == set(sizes)
 
 
 def test_of_other_streams_no_sample_passes_while_values_and_queries_do():
@@ -150,6 +214,41 @@ def test_a_writer_without_a_cache_is_named_by_an_exact_lookup():
             far.lookup("base", "lower", exact=True, timeout_s=0.3)
 
 
+def test_lookups_across_sites_are_refused_by_name_if_a_clock_is_off():
+    """r1 is 2 s ahead; both stand in one map. Within one robot lookups go on, and ages are corrected."""
+    ahead = ShiftedClock()
+    ahead.shift_ns = 2_000_000_000
+    with (
+        running_site(("r1", "r2"), {"joint_states": THIN_HZ, "transforms": THIN_HZ}) as site,
+        StatePublisher(site.local, RRBOT, "r1", clock=ahead) as off,
+        StatePublisher(site.local, RRBOT, "r2") as right,
+        StaticPublisher(site.local, "r1", "place") as place,
+        StaticPublisher(site.local, "r2", "place") as other_place,
+        TransformListener(site.far) as far,
+    ):
+        place.set(Transform("fleet/map", "r1/world", (0.0, 0.0, 0.0), UPRIGHT))
+        other_place.set(Transform("fleet/map", "r2/world", (5.0, 0.0, 0.0), UPRIGHT))
+
+        def mismatch() -> ClockMismatch | None:
+            for publisher in (off, right):
+                publisher.publish([0.1, 0.2])
+            with suppress(UnknownFrame, Disconnected, NoData, Stale, InPast, InFuture):
+                try:
+                    far.buffer.lookup("r1/lower", "r2/lower")
+                except ClockMismatch as error:
+                    return error
+            return None
+
+        until(lambda: mismatch() is not None, timeout_s=30.0)
+        error = mismatch()
+        assert error is not None
+        assert re.search(r"robot 'r1' is stamped in 'site plant1 \(\+2\.0 s\)' time", str(error))
+        until(lambda: (off.publish([0.1, 0.2]), far.buffer.can_lookup("fleet/map", "r1/lower"))[1])
+        with pytest.raises(Stale) as stale:
+            far.buffer.lookup("fleet/map", "r1/lower", max_age_s=0.0)
+        assert 0.0 < stale.value.age_s < 2.0
+
+
 def test_a_site_is_announced_with_its_robots_and_rates():
     many = tuple(f"robot_{number:04}" for number in range(1000))
     with connect() as session:
@@ -161,6 +260,20 @@ def test_a_site_is_announced_with_its_robots_and_rates():
             assert sites.thinning("robot_0000", "robot_description") is None
             assert sites.thinning("other", "joint_states") is None
         assert discover_sites(session).robots == {}
+
+
+def test_a_silent_link_is_noticed_by_the_period_that_the_site_announces():
+    events: list[WriterEvent] = []
+    with (
+        running_site(("r1",), {"joint_states": THIN_HZ}) as site,
+        TransformListener(site.far, "r1", on_event=events.append) as far,
+        TransformListener(site.local, "r1") as near,
+        StatePublisher(site.local, RRBOT, "r1") as publisher,
+    ):
+        until(lambda: (publisher.publish([0.1, 0.2]), far.stats.received >= 3)[1], timeout_s=30.0)
+        assert near.stats.received > far.stats.received
+        until(lambda: any(one.kind == "stale" for one in events))
+        assert "or the link of its site is down" in next(one for one in events if one.kind == "stale").text
 
 
 def test_tools_at_headquarters_call_no_sample_lost_that_the_site_holds_back():

@@ -133,7 +133,7 @@ def counter(endpoint: str) -> None:
     """Counts what arrives of a flood."""
     arrived: list[int] = []
     with connect(mode="client", endpoints=endpoint) as session:
-        session.zenoh.declare_subscriber("flood/**", lambda _: arrived.append(1))
+        session.zenoh.declare_subscriber("zstate/r1/status/*", lambda _: arrived.append(1))
         serve(arrived=lambda: len(arrived))
 
 
@@ -145,10 +145,14 @@ def flood(endpoint: str) -> None:
         connect(mode="client", endpoints=endpoint) as reader,
     ):
         reader.zenoh.declare_subscriber(
-            "flood/**", lambda one: ages_s.append(time.monotonic() - float(one.payload.to_string()[:20]))
+            "zstate/r1/status/*",
+            lambda one: ages_s.append(time.monotonic() - float(one.payload.to_string()[:20])),
         )
         block = zenoh.CongestionControl.BLOCK
-        keys = [writer.zenoh.declare_publisher(f"flood/{n}", congestion_control=block) for n in range(50)]
+        keys = [
+            writer.zenoh.declare_publisher(f"zstate/r1/status/{n}", congestion_control=block)
+            for n in range(50)
+        ]
 
         def run(seconds: float) -> dict[str, float]:
             begin, ticks = time.monotonic(), round(seconds * RATE_HZ)

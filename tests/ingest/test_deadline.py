@@ -31,6 +31,21 @@ def test_deadline_is_ten_periods_and_at_least_half_a_second(period_s: float, sil
     assert next_s == math.inf
 
 
+@pytest.mark.parametrize(
+    ("period_s", "thinned_s", "silence_s"),
+    [(0.2, 0.2, 3 * 0.2 + 0.2), (1.0, 1.0, 3 * 1.0 + 0.2), (0.05, 0.05, 0.5), (0.02, 0.2, 0.5)],
+)
+def test_of_a_thinned_stream_three_periods_and_a_margin_are_enough(
+    period_s: float, thinned_s: float, silence_s: float
+):
+    """Within its site the same robot comes faster, and is treated as any other."""
+    monitor = monitored(*(100.0 + period_s * number for number in range(50)))
+    monitor.thinned_s = {"r1": thinned_s, "r2": 1e-3}
+    due_s = 100.0 + period_s * 49 + silence_s
+    assert monitor.expired(due_s - 1e-3) == ({}, pytest.approx(due_s))
+    assert monitor.expired(due_s + 1e-3) == ({WRITER: pytest.approx(silence_s + 1e-3)}, math.inf)
+
+
 def test_writer_becomes_stale_once_until_its_next_sample():
     monitor = monitored(1.0, 1.1)
     assert monitor.expired(9.0)[0]

@@ -46,12 +46,12 @@ from zstate.archive.layout import (
 )
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.joint_samples import track_samples
 from zstate.buffer.tracks import JointTrack, PoseTrack
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
 from zstate.ingest.counters import Counters
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
-from zstate.plugins import stream_named
 from zstate.recording.decode import (
     DecodedMessage,
     DecodedRecording,
@@ -59,6 +59,7 @@ from zstate.recording.decode import (
     RecordedWriter,
     UndecodedRecord,
 )
+from zstate.recording.errors import RecordingError
 from zstate.recording.export import joint_columns
 from zstate.recording.joint_parts import has_parts
 from zstate.recording.joint_states import DELAYED_NS, JointStateBatch, RecordedJointReader
@@ -66,6 +67,7 @@ from zstate.recording.mcap.file import split_files
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recording import HISTORY_S, RecordingLoader
 from zstate.recording.stream_export import plain_columns
+from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import encode, encoding_of
@@ -461,7 +463,7 @@ class _RobotImport:
             if isinstance(track, JointTrack):
                 key = "" if track is robot else " ".join(track.model.joint_names)
                 present[PARTS if key else JOINTS, key] = ""
-                self._write_joints(key, track.samples(view, None, None))
+                self._write_joints(key, track_samples(track, view))
             else:
                 present |= {(EDGES, child): parent for parent, child in track.edges}
                 self._write_edges(track, view.kept_stamps(), view.kept_rows())

@@ -21,6 +21,8 @@ class ClockDomain:
         self.given = given
         """The domain of the user's clock, None without one."""
         self._by_robot: BoundedDict[str, str] = BoundedDict()
+        self._measured: BoundedDict[str, str] = BoundedDict()
+        self._ahead_ns: dict[str, int] = {}
         self._present: dict[str, None] = {}
         self._robot_by_child: BoundedDict[str, str] = BoundedDict()
         self._lock = fork_safe_lock()
@@ -40,6 +42,25 @@ class ClockDomain:
     def domain_of(self, robot: str) -> str | None:
         """The domain of ``robot``: empty if its wire format has none, None before its description."""
         return self._by_robot.get(robot)
+
+    def comparable(self, robot: str) -> str | None:
+        """The domain within which stamps of ``robot`` can be compared: its own, unless it was measured."""
+        return self._measured.get(robot) or self._by_robot.get(robot)
+
+    def ahead_ns(self, domain: str) -> int | None:
+        """How far a measured ``domain`` is ahead of the clock of this host; None for any other."""
+        return self._ahead_ns.get(domain)
+
+    def set_measured(self, robot: str, domain: str, ahead_ns: int = 0) -> bool:
+        """Set that ``robot`` has a clock of its own, called ``domain``, ``ahead_ns`` ahead of this host's.
+
+        Empty if its clock is that of its domain. Returns whether that is a change.
+        """
+        with self._lock:
+            before = self._measured.pop(robot, "")
+            if domain:
+                self._measured[robot], self._ahead_ns[domain] = domain, ahead_ns
+        return before != domain
 
     def robot_placing(self, child: str) -> str:
         """The robot whose writer places the frame ``child``: that of its name, unless another one does."""

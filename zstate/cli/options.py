@@ -86,7 +86,7 @@ class StreamChoice(click.Choice[str]):
 
     @property
     def choices(self) -> Sequence[str]:
-        from zstate.plugins import streams_where
+        from zstate.stream_registry import streams_where
 
         return streams_where(self._condition)
 

@@ -23,9 +23,9 @@ from functools import partial
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
-from zstate.plugins import all_streams, is_named, latched_streams, own_streams
+from zstate.net.user_config import user_config
+from zstate.stream_registry import all_streams, is_named, latched_streams, own_streams
 from zstate.wire.keys import (
     CLOCK_KEY,
     EDGE_TOKEN,
@@ -51,6 +51,14 @@ _WRITER, _EDGE, _READER = WRITER_TOKEN.verbatim, EDGE_TOKEN.verbatim, READER_TOK
 _REQUESTS = (MOTION, ODOMETRY_REQUEST)
 _VERBATIM = ("@adv", _WRITER, WRITER_CLOCK.verbatim, _EDGE, _READER, SITE_TOKEN.verbatim)
 """What viewers read although ``zstate/**`` does not match it: cached values, tokens and clocks."""
+MESSAGES = (*PUBLISH, *SUBSCRIBE)
+"""All messages that access control knows."""
+ALL_KEYS = (
+    "**",
+    *(f"**/{chunk}/**" for chunk in (*_VERBATIM, *(one.verbatim for one in _REQUESTS), "@", "@ros2_lv")),
+    "@/*/@ros2_lv/**",
+)
+"""All keys of zstate, of ROS and of Zenoh, and those of other programs without a chunk that begins with @."""
 _READING = ("NN", "MS", "SC")  # tokens of nodes, of their subscribers and of their service clients
 _NODE_TOPICS = ("rosout", "parameter_events")  # outside of all namespaces; each ROS node writes them
 _SECTIONS = ("rules", "subjects", "policies")

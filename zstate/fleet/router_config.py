@@ -6,170 +6,45 @@ Downsampling limits the rate at which a router forwards streams, for slow links.
 from __future__ import annotations
 
 import json
-import math
 import re
-import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.fleet.acl import AclRoles, Rule, access_control, check_namespace
-from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
+from zstate.fleet.acl import AclRoles, access_control
+from zstate.fleet.downsampling import Downsampling
+from zstate.fleet.uplink import Uplink
+from zstate.net.config import ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.credentials import Credentials
-from zstate.plugins import streams_where
-from zstate.streams import StreamName
-from zstate.wire.keys import ANY, check_robot, stream_expression
 
+ROS_ROUTER: dict[str, object] = {
+    "mode": "router",
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+    "routing": {"router": {"peers_failover_brokering": False}},
+    "timestamping": {"enabled": True},
+    # Many nodes start at once, and are busy with that for a while.
+    "queries_default_timeout": 600_000,
+    "transport": {
+        "unicast": {
+            "open_timeout": 60_000,
+            "accept_timeout": 60_000,
+            "accept_pending": 10_000,
+            "max_sessions": 10_000,
+        },
+        "link": {"tx": {"lease": 60_000, "keep_alive": 2}},
+        "shared_memory": {"enabled": False},
+    },
+}
+"""The settings of rmw_zenohd, except that it listens at tcp/[::]:7447, which is open to the network.
 
-def downsampled_streams() -> tuple[StreamName, ...]:
-    """The streams that may lose samples, those of other packages as well: each is replaced by a newer one."""
-    return streams_where(lambda row: row.is_sampled)
-
+ROS nodes are peers. They find each other through the router's gossip and exchange data directly; the router
+forwards between peers and clients.
+"""
 
 _WIDTH = 100
 _INDENT = "  "
 _BARE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-
-
-@dataclass(frozen=True, slots=True)
-class Downsampling:
-    """Limits on the samples per second that a router forwards to each neighbour.
-
-    ``rates_hz`` is the limit by stream, for each of ``robots``; ``interfaces`` are the network interfaces
-    that it applies to (default: all). The limits of streams with names, such as ``transforms``, are those of
-    all their writers of one robot together. Latched values are never dropped. Readers count dropped samples
-    as missed. Raises InvalidInput.
-    """
-
-    rates_hz: Mapping[str, float]
-    robots: tuple[str, ...]
-    interfaces: tuple[str, ...] = ()
-    namespace: str = ""
-
-    def __post_init__(self) -> None:
-        check_namespace(self.namespace)
-        _check_rates(self.rates_hz)
-        if not self.rates_hz or not self.robots:
-            # One rule for all robots would limit their sum, and starve some.
-            raise InvalidInput(
-                "downsampling needs streams and the names of the robots: each has a limit of its own"
-            )
-        for robot in self.robots:
-            check_robot(robot)
-
-    def settings(self) -> list[dict[str, object]]:
-        """The section ``downsampling`` of a Zenoh configuration."""
-        interfaces = {"interfaces": list(self.interfaces)} if self.interfaces else {}
-        rules = _rules(self.rates_hz, self.robots, self.namespace)
-        return [{"id": "streams", **interfaces, "flows": ["egress"], "messages": ["put"], "rules": rules}]
-
-
-def _check_rates(rates_hz: Mapping[StreamName, float], least_hz: float = sys.float_info.min) -> None:
-    for stream, rate_hz in rates_hz.items():
-        if stream not in downsampled_streams():
-            raise InvalidInput(f"{stream!r} cannot be downsampled; {', '.join(downsampled_streams())} can")
-        if not least_hz <= rate_hz < math.inf:
-            what = "a positive number of samples a second" if least_hz else "samples a second, 0 for none"
-            raise InvalidInput(f"{stream!r} at {rate_hz} Hz; give {what}")
-
-
-def _rules(rates_hz: Mapping[StreamName, float], robots: Iterable[str], namespace: str) -> list[Rule]:
-    """One rule for each robot: they would share the samples that one rule of all lets pass."""
-    prefix = f"{namespace}/" if namespace else ""
-    return [
-        {"key_expr": prefix + stream_expression(robot, stream), "freq": rates_hz[stream]}
-        for robot in dict.fromkeys(robots)
-        for stream in downsampled_streams()
-        if stream in rates_hz
-    ]
-
-
-_EARLY = 0.96
-"""A sample passes this part of the period after the last one: one that comes a little early passes as well,
-and 50 Hz at 5 Hz gives 5 Hz, not every eleventh sample."""
-
-
-@dataclass(frozen=True, slots=True)
-class Uplink:
-    """The link from the router of ``site`` to those of headquarters at ``endpoints``, and what passes on it.
-
-    ``rates_hz`` is the limit by stream, for each of ``robots``. Of streams at 0, and of those without a rate,
-    no sample passes, of any robot. Latched values, commands, stops, tokens, the simulated time, queries and
-    their replies always pass; samples and values are dropped if the link is full, and never wait.
-
-    ``interfaces`` are the network interfaces of the link. Without them, its protocol distinguishes it from
-    the local ones. Raises InvalidInput.
-    """
-
-    site: str
-    endpoints: tuple[str, ...]
-    rates_hz: Mapping[StreamName, float]
-    robots: tuple[str, ...]
-    interfaces: tuple[str, ...] = ()
-    namespace: str = ""
-
-    def __post_init__(self) -> None:
-        check_robot(self.site, "site")
-        check_namespace(self.namespace)
-        _check_rates(self.rates_hz, 0.0)
-        for robot in self.robots:
-            check_robot(robot)
-        if not self.endpoints:
-            raise InvalidInput(f"the site {self.site!r} has no uplink; give the endpoint of headquarters")
-        if not self.robots:
-            raise InvalidInput(
-                f"the site {self.site!r} names no robots: each has a limit of its own on the uplink; give "
-                "their names (--robot NAME, or --robot-file FILE with one name on each line)"
-            )
-
-    @property
-    def passing(self) -> tuple[StreamName, ...]:
-        """The streams of samples that pass, thinned."""
-        return tuple(stream for stream, rate_hz in self.rates_hz.items() if rate_hz)
-
-    @property
-    def text(self) -> str:
-        """What passes, in a sentence."""
-        rates = [f"{stream} at {self.rates_hz[stream]:g} Hz" for stream in self.passing]
-        count, robots = len(set(self.robots)), "robot" if len(set(self.robots)) == 1 else "robots"
-        return (
-            f"{' and '.join(rates) or 'no samples'} of {count} {robots} leave for {', '.join(self.endpoints)}"
-        )
-
-    def settings(self, others: Sequence[str]) -> dict[str, object]:
-        """The sections ``downsampling`` and ``qos`` of a Zenoh configuration.
-
-        ``others`` are the endpoints of all other links of the router. Raises ConfigError if the uplink cannot
-        be distinguished from them.
-        """
-        passing = {stream: self.rates_hz[stream] / _EARLY for stream in self.passing}
-        # Of a key that matches two rules Zenoh takes any of them: no rule for all of a stream that passes.
-        blocked = {stream: 0.0 for stream in downsampled_streams() if stream not in passing}
-        rules = [*_rules(passing, self.robots, self.namespace), *_rules(blocked, (ANY,), self.namespace)]
-        uplink = {**self._link(others), "flows": ["egress"], "messages": ["put"]}
-        overwrite = {"key_exprs": ["**", "**/@adv/**"], "overwrite": {"congestion_control": "drop"}}
-        return {
-            "downsampling": [{"id": "uplink", **uplink, "rules": rules}],
-            "qos/network": [{"id": "uplink", **uplink, **overwrite}],
-        }
-
-    def _link(self, others: Sequence[str]) -> dict[str, list[str]]:
-        """The conditions by which the uplink is distinguished from other links."""
-        if self.interfaces:
-            return {"interfaces": list(self.interfaces)}
-        protocols = {endpoint.partition("/")[0] for endpoint in self.endpoints}
-        if shared := protocols & {endpoint.partition("/")[0] for endpoint in others}:
-            protocol = min(shared)
-            alike = next(endpoint for endpoint in others if endpoint.startswith(f"{protocol}/"))
-            raise ConfigError(
-                f"the uplink {self.endpoints[0]!r} cannot be distinguished from {alike!r}: both are "
-                f"{protocol}, and links are thinned by protocol or network interface; give the interface of "
-                "the uplink (--wan wwan0), or choose another protocol for one of the two, such as quic for "
-                "the uplink",
-                path="uplink",
-            )
-        return {"link_protocols": sorted(protocols)}
 
 
 _ACCESS_HEAD = """\
@@ -204,7 +79,8 @@ _COMMENTS = {
     "transport/shared_memory": "No gain for messages this small.",
     "downsampling": "Limit of samples per second [Hz] to each neighbour, by rule, not by key.",
     "qos": "Samples and values that leave on the uplink are dropped if it is full; none waits.",
-    "access_control": "Allowed messages by identity; all others are denied.",
+    "low_pass_filter": "Larger samples, values and replies [B] do not leave on the uplink.",
+    "access_control": "Allowed messages, by identity or link; all others are denied.",
 }
 _ROS_COMMENTS = {
     "scouting": "From here on as in rmw_zenohd: ROS nodes are peers, which find each other through it.",
@@ -270,11 +146,11 @@ class RouterConfig:
             settings |= self.credentials.settings()
         if self.downsampling is not None:
             settings["downsampling"] = self.downsampling.settings()
-        if self.uplink is not None:
-            settings |= self.uplink.settings((*self.listen, *self.connect))
         if self.access_control or self.uplink is not None:
             settings["scouting/gossip/enabled"] = False
-        if self.access_control:
+        if self.uplink is not None:
+            settings |= self.uplink.settings((*self.listen, *self.connect), self.access_control)
+        elif self.access_control:
             settings["access_control"] = self.access_control
         nested: dict[str, Any] = {}
         _merge(nested, settings)

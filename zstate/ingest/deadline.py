@@ -5,11 +5,15 @@ page and the events of a listener all apply this rule. The floor is 0.5 s becaus
 fast writer on a busy host or a wireless link pauses for tenths of a second without being in trouble, and
 because ``WriterEvent`` documents it. A writer with an unknown period, of fewer than two samples, is
 never stale: its robot may just not have moved.
+
+Samples that a site's router thins (zstate.net.sites) come at a fixed period, whatever the writer does: three
+of these and a margin for the link are enough.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from zstate._util.fork_safe import fork_safe_lock
@@ -17,13 +21,19 @@ from zstate._util.fork_safe import fork_safe_lock
 FLOOR_S = 0.5
 PERIODS = 10
 _SMOOTHING = 0.1
+_THINNED_PERIODS = 3
+_THINNED_MARGIN_S = 0.2
+_THINNED_LEAST = 0.8
+"""Of the thinned period: samples that come faster were not thinned, as within the site."""
 
 Writer = tuple[str, int]
 """A robot, and the session of one of its writers."""
 
 
-def deadline_s(period_s: float) -> float:
-    """How long [s] a writer of this period may be silent."""
+def deadline_s(period_s: float, thinned_s: float = math.inf) -> float:
+    """How long [s] a writer of this period may be silent; ``thinned_s`` is that at which a site lets pass."""
+    if period_s > _THINNED_LEAST * thinned_s:
+        return max(FLOOR_S, _THINNED_PERIODS * period_s + _THINNED_MARGIN_S)
     return max(FLOOR_S, PERIODS * period_s)
 
 
@@ -64,9 +74,13 @@ class Deadline:
     @property
     def due_s(self) -> float:
         """When the writer becomes stale, unless a sample arrives."""
+        return self.due_if_thinned_s(math.inf)
+
+    def due_if_thinned_s(self, thinned_s: float) -> float:
+        """``due_s`` if a site lets samples pass at this period."""
         if not self.samples:
             return math.inf
-        return self.last_s + (deadline_s(self.period_s) if self.samples > 1 else self.unknown_s)
+        return self.last_s + (deadline_s(self.period_s, thinned_s) if self.samples > 1 else self.unknown_s)
 
     def is_missed(self, now_s: float) -> bool:
         """Whether the writer is stale."""
@@ -84,6 +98,8 @@ class DeadlineMonitor:
     """Deadlines of registered writers, by a monotonic clock [s]. Thread-safe."""
 
     def __init__(self) -> None:
+        self.thinned_s: Mapping[str, float] = {}
+        """The periods at which sites let samples pass, by robot. May be replaced at any time."""
         self._writers: dict[Writer, _Registered] = {}
         self._lock = fork_safe_lock()
 
@@ -117,13 +133,18 @@ class DeadlineMonitor:
     def expired(self, now_s: float) -> tuple[dict[Writer, float], float]:
         """Writers that became stale since the last call, with their silence [s]; and the next due time."""
         with self._lock:
-            fresh = {writer: one for writer, one in self._writers.items() if not one.is_stale}
+            thinned_s = self.thinned_s
+            due_s = {
+                writer: one.deadline.due_if_thinned_s(thinned_s.get(writer[0], math.inf))
+                for writer, one in self._writers.items()
+                if not one.is_stale
+            }
             stale = {
-                writer: now_s - one.deadline.last_s
-                for writer, one in fresh.items()
-                if one.deadline.due_s <= now_s
+                writer: now_s - self._writers[writer].deadline.last_s
+                for writer, due in due_s.items()
+                if due <= now_s
             }
             for writer in stale:
-                fresh.pop(writer).is_stale = True
-            next_s = min((one.deadline.due_s for one in fresh.values()), default=math.inf)
+                self._writers[writer].is_stale = True
+            next_s = min((due for due in due_s.values() if due > now_s), default=math.inf)
         return stale, next_s

@@ -24,8 +24,9 @@ class WriterEvent:
     - "left": it was closed, or its process ended, while the network is up;
     - "cut off": the router that connected it is lost, or it was silent before it disappeared; it may still
       publish. "back": the same writer is connected again;
-    - "stale": it is announced, but no sample came for ten of its periods (at least half a second): it is
-      frozen, or its source is. "resumed": samples come again;
+    - "stale": it is announced, but no sample came for ten of its periods (at least half a second), or for
+      three and 0.2 s where its site thins the stream: it is frozen, its source is, or the link of the site is
+      down. "resumed": samples come again;
     - "set back": its clock was set back, so the robot's history begins with its next sample;
     - "conflict": another writer publishes the same stream, or places the same frame.
 

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Generic, Literal, TypeVar
 
 from zstate._util.bounded import MAX_ENTRIES, BoundedDict
@@ -16,7 +16,7 @@ from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.diagnostics import Kind, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 
@@ -157,6 +157,10 @@ class EventLog(Closeable):
         if self._thread is not None:
             self._thread.close()
 
+    def set_thinned(self, periods_s: Mapping[str, float]) -> None:
+        """Set the periods at which sites let samples pass, by robot: "stale" follows from them."""
+        self._deadlines.thinned_s = periods_s
+
     def on_writer(self, announced: Announcement, alive: bool) -> None:
         """Add the event of a writer that is announced, or is not any more."""
         if announced.stream in self._streams:
@@ -282,7 +286,8 @@ class EventLog(Closeable):
             return
         lasting = format_duration(round(silent_s * 1e9))
         if kind == "stale":
-            text = f"for {lasting}, though it is announced: it is frozen, or its source is"
+            link = ", or the link of its site is down" if robot in self._deadlines.thinned_s else ""
+            text = f"for {lasting}, though it is announced: it is frozen, or its source is{link}"
         else:
             text = f"for {lasting}; samples come again"
         text = f"{robot!r}: {announced.writer} published nothing on {announced.stream} {text}"

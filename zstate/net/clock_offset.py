@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import zenoh
 
@@ -46,6 +47,8 @@ _MAX_IN_FLIGHT = 1
 """Queries in flight together would delay each other."""
 
 _DISCOVERY_S = 0.05
+
+OnMeasured: TypeAlias = Callable[[str, WriterId, ClockOffset], object]
 
 _MOST_OF_A_TIMEOUT = 0.9
 """A query that took this part of its timeout has timed out."""
@@ -171,7 +174,8 @@ class ClockOffsetMonitor:
     """Measures the clock offsets of writers when they are read, by requests of ``thread``.
 
     ``offsets`` has a function for the printed name of each watched writer, which returns its offset. Robots
-    take turns: silent writers of one robot do not delay those of another for long.
+    take turns: silent writers of one robot do not delay those of another for long. ``on_measured(robot,
+    writer, offset)`` is called in ``thread`` after each measurement.
     """
 
     def __init__(
@@ -180,8 +184,10 @@ class ClockOffsetMonitor:
         thread: ServiceThread,
         clock: Clock,
         offsets: dict[str, Callable[[], ClockOffset | None]] | None = None,
+        on_measured: OnMeasured | None = None,
     ) -> None:
         self._requests = Requests(session, thread, _MAX_IN_FLIGHT)
+        self._on_measured = on_measured
         self._clock = clock
         self._offsets = {} if offsets is None else offsets
         self._watched: dict[WriterId, _WriterOffset] = {}
@@ -190,7 +196,9 @@ class ClockOffsetMonitor:
         """A function that returns the clock offset of ``writer``; measured now, and again after 30 s."""
         offset = self._watched.get(writer)
         if offset is None:
-            offset = self._watched[writer] = _WriterOffset(self._requests, self._clock, robot, writer)
+            offset = self._watched[writer] = _WriterOffset(
+                self._requests, self._clock, robot, writer, self._on_measured
+            )
             offset()
             self._offsets[str(writer)] = offset
         return offset
@@ -205,8 +213,16 @@ class ClockOffsetMonitor:
 class _WriterOffset(Request):
     """The offset of the clock of ``writer`` from ``clock``, if it is known; reading it requests it again."""
 
-    def __init__(self, requests: Requests, clock: Clock, robot: str, writer: WriterId) -> None:
+    def __init__(
+        self,
+        requests: Requests,
+        clock: Clock,
+        robot: str,
+        writer: WriterId,
+        on_measured: OnMeasured | None,
+    ) -> None:
         self.source = robot
+        self._writer, self._on_measured = writer, on_measured
         self._requests = requests
         self._clock = clock
         self._key = WRITER_CLOCK.key(robot, writer.identity)
@@ -254,6 +270,8 @@ class _WriterOffset(Request):
         if self._measured:
             best = min(self._measured, key=lambda one: one.round_trip_ns)
             self._known = ClockOffset(best.offset_ns, best.uncertainty_ns)
+            if self._on_measured is not None:
+                self._on_measured(self.source, self._writer, self._known)
         self._unanswered = 0 if self._measured else self._unanswered + 1
         self._began_s, self._measured = 0.0, []
         if 0 < self._unanswered < len(_TIMEOUTS_S):

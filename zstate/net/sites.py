@@ -6,15 +6,20 @@ of sites.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import NamedTuple
+
+import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate.errors import InvalidInput
-from zstate.net.presence import announce, confirmed_tokens
+from zstate.net.presence import CAPACITY, announce, confirmed_tokens
+from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
-from zstate.plugins import find_stream
+from zstate.net.streams import Receiver
+from zstate.stream_registry import find_stream
 from zstate.streams import StreamName
 from zstate.wire.keys import SITE_TOKEN
 
@@ -66,6 +71,15 @@ class Sites(NamedTuple):
             return None
         return Thinning(site, self.rates_hz[site].get(stream, 0.0))
 
+    def periods_s(self, stream: StreamName) -> dict[str, float]:
+        """The periods at which samples of ``stream`` pass, by robot; without those of which none pass."""
+        return {
+            robot: 1.0 / rate_hz
+            for site, robots in self.robots.items()
+            if (rate_hz := self.rates_hz[site].get(stream))
+            for robot in robots
+        }
+
 
 NO_SITES = Sites({}, {})
 
@@ -114,3 +128,19 @@ def sites_from_tokens(tokens: Iterable[str]) -> Sites:
             rates_hz.setdefault(site, {}).update(rates)
             robots[site] = robots.get(site, frozenset()) | frozenset(names)
     return Sites(rates_hz, robots)
+
+
+class SiteWatch(Receiver):
+    """Calls ``on_change(sites)`` in ``thread`` with the announced sites, now and after each change."""
+
+    def __init__(self, session: Session, thread: ServiceThread, on_change: Callable[[Sites], object]) -> None:
+        self._tokens: set[str] = set()
+        self._on_change = on_change
+        declare = partial(session.zenoh.liveliness().declare_subscriber, history=True)
+        super().__init__(session, [SITE_TOKEN.expression()], declare, CAPACITY, thread=thread)
+
+    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
+        for sample in batch:
+            is_put = sample.kind == zenoh.SampleKind.PUT
+            (self._tokens.add if is_put else self._tokens.discard)(str(sample.key_expr))
+        self._on_change(sites_from_tokens(self._tokens))

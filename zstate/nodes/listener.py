@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from zstate._util.closeable import Closeable
 from zstate._util.format import did_you_mean
+from zstate._util.tf2_methods import missing_method
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer, feed_of
 from zstate.clock import Clock
 from zstate.errors import InvalidInput
@@ -56,7 +57,8 @@ class TransformListener(Closeable):
     /tf_static but those of a model, which robot_state_publisher repeats. A context manager.
 
     The clock domain of each robot is the one in its description, and robots of different domains may share
-    the buffer; a lookup across two of them raises ClockMismatch. Input that cannot be used is counted in
+    the buffer; a lookup across two of them raises ClockMismatch. So does one to a robot of a site whose clock
+    is more than 0.1 s off, as measured. Input that cannot be used is counted in
     ``stats``, logged once through ``logging``, and never stops the stream.
 
     In a forked process nothing fills the buffer: it answers from the samples it has, waits end at once, and
@@ -131,8 +133,6 @@ class TransformListener(Closeable):
     if not TYPE_CHECKING:  # type checkers report such names themselves
 
         def __getattr__(self, name: str) -> NoReturn:
-            from zstate._util.other_names import missing_method  # noqa: PLC0415 - for mistakes alone
-
             raise missing_method(self, name, self.__dict__.get("buffer"))
 
     def lookup(

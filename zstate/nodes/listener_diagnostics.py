@@ -14,9 +14,10 @@ from zstate.ingest.events import EventLog
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.ingest.robot_ingests import Follow, sample_streams
 from zstate.ingest.stamp_checks import StampCheck
-from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
+from zstate.net.sites import Sites, SiteWatch
+from zstate.nodes.site_clocks import SiteClocks
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.messages import Sample
@@ -43,17 +44,22 @@ class ListenerDiagnostics(Diagnostics, Closeable):
     ) -> None:
         self._streams = sample_streams(wire, follow)
         self._stamp_check = StampCheck(buffer, counters, is_described=not wire.shared)
-        self._clock_offsets: ClockOffsetMonitor | None = None
+        self._follow = follow
+        self._clocks: SiteClocks | None = None
         if not wire.shared and buffer.clock.domain == SYSTEM:
-            offsets = feed_of(buffer).clock_offsets
-            self._clock_offsets = ClockOffsetMonitor(session, thread, buffer.clock, offsets)
+            self._clocks = SiteClocks(session, thread, feed_of(buffer))
         streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._streams)
         self._events = EventLog(streams, follow, wire.shared, on_event)
         self._has_deadlines = on_event is not None
+        self._sites: SiteWatch | None = None
         if self._has_deadlines:
             self.on_usual_sample = self._events.on_sample
+        if not wire.shared:
+            self._sites = SiteWatch(session, thread, self._on_sites)
 
     def close(self) -> None:
+        if self._sites is not None:
+            self._sites.close()
         self._events.close()
 
     def events(self) -> tuple[WriterEvent, ...]:
@@ -72,11 +78,14 @@ class ListenerDiagnostics(Diagnostics, Closeable):
 
     def on_writer(self, announced: Announcement, *, alive: bool) -> None:
         self._events.on_writer(announced, alive)
-        if self._clock_offsets is not None and announced.stream in self._streams:
-            if alive:
-                self._clock_offsets.watch(announced.robot, announced.writer)
-            else:
-                self._clock_offsets.unwatch(announced.writer)
+        if self._clocks is not None and announced.stream in self._streams:
+            watch = self._clocks.watch if alive else self._clocks.unwatch
+            watch(announced.robot, announced.writer)
+
+    def _on_sites(self, sites: Sites) -> None:
+        self._events.set_thinned(sites.periods_s(self._follow))
+        if self._clocks is not None:
+            self._clocks.on_sites(sites)
 
     def on_cut_off(self, announced: Announcement) -> None:
         self._events.on_cut_off(announced)

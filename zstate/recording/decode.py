@@ -14,7 +14,6 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import edge_streams, is_value, stream_named, streams_where
 from zstate.recording.covariances import (
     CovarianceJoin,
     EdgeCovariance,
@@ -25,16 +24,11 @@ from zstate.recording.covariances import (
 from zstate.recording.encode import NUMBER, POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
+from zstate.stream_registry import edge_streams, is_value, stream_named, streams_where
 from zstate.streams import StreamName
 from zstate.wire.json_form import JsonDecoder, carried_as_json
-from zstate.wire.messages import (
-    JointState,
-    Message,
-    RobotDescription,
-    StaticTransforms,
-    TransformSample,
-    with_field,
-)
+from zstate.wire.measurements import with_field
+from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.streams import (

@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import quote
 
 from zstate._util.closeable import Closeable
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.file import McapFile, explain_unreadable, open_errors, split_files
 from zstate.recording.mcap.records import MAGIC
 from zstate.recording.storage import (

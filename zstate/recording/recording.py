@@ -35,10 +35,9 @@ from zstate.errors import InvalidInput
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest
+from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
-from zstate.plugins import stream_named
 from zstate.recording.decode import (
     STREAMS,
     DecodedMessage,
@@ -54,8 +53,10 @@ from zstate.recording.decode import (
 from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
 from zstate.recording.joint_states import RecordedJointReader
+from zstate.recording.model_edges import ModelEdgeFilter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.transforms import EdgeEpochs, RecordedTransformIngest, children_of
+from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (

@@ -272,7 +272,7 @@ def _open_sliders(
 
     A name is that of an announced robot; if no such robot is announced, that of a catalog model.
     """
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.view.sliders import SliderPublisher
 
     within_s = _DISCOVERY_S if named else _ANNOUNCED_WITHIN_S

@@ -215,19 +215,22 @@ def test_a_site_prints_what_passes_and_runs_it(free_port: int, tmp_path: Path):
         with connect(mode="client", endpoints=headquarters) as far:
             until(lambda: discover_sites(far).robots == {"plant1": frozenset({"r1", "r2"})})
             with connect(mode="client", endpoints=local) as near, StatePublisher(near, RRBOT, "r3"):
-                until(lambda: "'r3' has no rule" in command.stderr)
+                until(lambda: "'r3' is not named" in command.stderr)
 
     with router(headquarters):
         run_watched(run, *arguments)
     printed = json.loads(str(zenoh.Config.from_json5(run_cli(*arguments, "--print").stdout)))
     rules = printed["downsampling"][0]["rules"]
-    assert [one["key_expr"] for one in rules if one["freq"]] == [f"zstate/r{n}/joint_states" for n in (1, 2)]
+    assert [one["key_expr"] for one in rules] == [f"zstate/r{n}/joint_states" for n in (1, 2)]
+    limited = run_cli(*arguments, "--largest", "64", "--print").stdout
+    assert "size_limit: 64000" in limited
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("--uplink", "tls/hq:7447"), "--uplink and --thin need --site"),
+        (("--uplink", "tls/hq:7447"), "--largest need --site"),
+        (("--largest", "0"), "at least one byte"),
         (("--site", "plant1", "--robot", "r1"), "has no uplink"),
         (("--site", "plant1", "--uplink", "tls/hq:7447"), "names no robots"),
         (("--site", "plant1", "--uplink", "tls/hq:7447", "--downsample", "tf=1"), "exclude each other"),

@@ -87,7 +87,7 @@ def archive_command(context: click.Context, *, url: str, recordings: tuple[str, 
 
 def _add(url: str, recordings: tuple[str, ...]) -> None:
     from zstate.archive.importer import import_recording
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
 
     failed: list[str] = []
     for recording in recordings:
@@ -168,7 +168,7 @@ def cut_command(url: str, *, file: str, robot: str, window: tuple[int, int] | No
     zstate view minute.mcap
     """
     from zstate.archive.cut import cut
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
 
     if window is None:
         raise click.UsageError("name the window by --at TIME, or by --from TIME --to TIME")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Iterable
@@ -16,13 +17,21 @@ from zstate.cli.metrics import connection_rows, serve_metrics, writer_rows
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput
+from zstate.streams import KILOBYTE
 
 if TYPE_CHECKING:
-    from zstate.fleet.router_config import Uplink
+    from zstate.fleet.uplink import Uplink
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.security.credentials import Credentials
     from zstate.net.session import Session
     from zstate.streams import StreamName
+
+
+def _check_size(kilobytes: float) -> float:
+    if not 0.001 <= kilobytes < math.inf:
+        raise InvalidInput(f"a size is a number of kilobytes, at least one byte; got {kilobytes:g}")
+    return kilobytes
 
 
 @click.command("router")
@@ -53,6 +62,11 @@ if TYPE_CHECKING:
     metavar="STREAM=HZ[,...]",
     help="Samples per second of each robot that pass on the uplink; of other streams none pass.",
 )
+@click.option(
+    "--largest",
+    type=options.number("KB", _check_size),
+    help="Larger pictures, clouds, scans and maps do not pass on the uplink; models and joints do.",
+)
 @click.option("--robot", multiple=True, metavar="NAME", help="Thin this robot; may be repeated.")
 @click.option("--robot-file", type=options.EXISTING_FILE, help="Thin these robots: a name on each line.")
 @click.option(
@@ -81,6 +95,7 @@ def router_command(
     site: str | None,
     uplink: tuple[str, ...],
     thin: tuple[str, ...],
+    largest: float | None,
     robot: tuple[str, ...],
     robot_file: str | None,
     wan: tuple[str, ...],
@@ -98,8 +113,8 @@ def router_command(
     use it with `--connect tcp/HOST:7447`. zenohd accepts the output of `--print`; the password of --user is
     masked there, but not with `--output FILE`.
 
-    With --site, programs of the site have all samples at their full rate, and headquarters has those that
-    --thin names. Latched values, commands, stops and queries pass in any case.
+    With --site, programs of the site have all samples at their full rate, and headquarters has those of the
+    robots and streams that --robot and --thin name. Latched values, commands, stops and queries pass as well.
 
     \b
     zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router --acl acl.json5
@@ -110,7 +125,9 @@ def router_command(
     zstate router --ros2 --listen "tcp/[::]:7447"      # for all hosts, as rmw_zenohd
     """
     from zstate.fleet.acl import read_access_control
-    from zstate.fleet.router_config import Downsampling, RouterConfig, Uplink
+    from zstate.fleet.downsampling import Downsampling
+    from zstate.fleet.router_config import RouterConfig
+    from zstate.fleet.uplink import Uplink
     from zstate.net.config import ROUTER_ENDPOINT, check_credentials, listen_endpoints
 
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
@@ -126,8 +143,8 @@ def router_command(
         _run(SessionOptions("router", connect, listen, config, credentials), listen, metrics, file)
         return
     robots = (*robot, *(_names_in(robot_file) if robot_file else ()))
-    if site is None and (uplink or thin):
-        raise click.UsageError("--uplink and --thin need --site NAME")
+    if site is None and (uplink or thin or largest):
+        raise click.UsageError("--uplink, --thin and --largest need --site NAME")
     if site is not None and (downsample or ros2):
         what = "--downsample" if downsample else "--ros2, whose topics no rule thins,"
         raise click.UsageError(f"{what} and --site exclude each other; --thin limits what leaves a site")
@@ -138,7 +155,8 @@ def router_command(
     link = downsampling = None
     if site is not None:
         rates = _rates("--thin", [text for one in thin for text in one.split(",")])
-        link = Uplink(site, uplink, rates, robots, wan, namespace)
+        largest_bytes = None if largest is None else round(largest * KILOBYTE)
+        link = Uplink(site, uplink, rates, robots, wan, namespace, largest_bytes)
         # Of a site with certificates the uplink is encrypted, and the programs of this host need not be.
         listen = listen or (ROUTER_ENDPOINT,)
     elif downsample:
@@ -211,19 +229,19 @@ def _run(
         while True:
             wait_interruptible(changed)
             changed.clear()
-            for robot in sorted(_robots_without_rules(session, directory, uplink) - named):
+            for robot in sorted(_unnamed_robots(session, directory, uplink) - named):
                 named.add(robot)
                 print_status(
-                    f"{robot!r} has no rule: if it is behind this router, all its samples of "
-                    f"{', '.join(uplink.passing)} leave on the uplink; start the router with --robot {robot}"
+                    f"{robot!r} is not named: if it is behind this router, no sample of it leaves on the "
+                    f"uplink; start the router with --robot {robot}"
                 )
 
 
-def _robots_without_rules(session: Session, directory: RobotDirectory, uplink: Uplink) -> set[str]:
+def _unnamed_robots(session: Session, directory: RobotDirectory, uplink: Uplink) -> set[str]:
     """The announced robots with a stream that passes on ``uplink``, but for those of all announced sites."""
     from zstate.net.sites import discover_sites
 
-    passing, ruled = set(uplink.passing), set(uplink.robots)
+    passing, named = set(uplink.passing), set(uplink.robots)
     writers = ((one.name, stream) for one in directory.robots() for stream, _ in one.writers)
-    robots = {robot for robot, stream in writers if stream in passing and robot not in ruled}
+    robots = {robot for robot, stream in writers if stream in passing and robot not in named}
     return robots.difference(*discover_sites(session).robots.values()) if robots else robots

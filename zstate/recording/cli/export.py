@@ -151,7 +151,7 @@ def export_command(
         raise click.UsageError("--fps and --task are those of a dataset: name its folder with --lerobot DIR")
     if len(rest) > 1:
         raise click.UsageError(f"one RECORDING makes one file; got also {', '.join(rest[:-1])}")
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.export import Exporter
     from zstate.recording.recording import Recording
     from zstate.recording.stores import opened_path
@@ -199,10 +199,10 @@ def _export_stream(
     frame: str | None,
     overwrite: bool,
 ) -> None:
-    from zstate.errors import RecordingError
-    from zstate.plugins import stream_named
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recording import Recording
     from zstate.recording.stream_export import export_points, export_stream
+    from zstate.stream_registry import stream_named
 
     path = Path(output) if output else opened.named.with_suffix(f".{stream}.{kind}")
     with Recording(opened.path, robot) as recording:
@@ -225,7 +225,7 @@ def _export_stream(
 
 
 def _export_lerobot(names: Sequence[str], folder: str, fps: int, task: str, *, overwrite: bool) -> None:
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.lerobot import export_lerobot
 
     *others, last = names

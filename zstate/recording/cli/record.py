@@ -30,9 +30,9 @@ from zstate.recording.cli.metrics import recorder_rows
 
 if TYPE_CHECKING:
     from zstate.clock import Clock
-    from zstate.errors import RecordingError
     from zstate.metrics.endpoint import BindAddress
     from zstate.recording.background_store import BackgroundStore
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder, RecorderStats
     from zstate.recording.retention import FilePattern, Keep, Retention
 
@@ -132,8 +132,8 @@ def record_command(
     zstate record rec-%Y%m%d-%H%M%S.mcap --split-size 500 --keep 50GB
     zstate record rec-%Y%m%d-%H%M%S.mcap --split-seconds 600 --keep 7d --archive s3://plant/fleet
     """
-    from zstate.errors import RecordingError
     from zstate.recording.background_store import BackgroundStore
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder
 
     pattern = _file_pattern(file)
