@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
@@ -26,7 +27,9 @@ Stamps = NDArray[np.int64]
 T = TypeVar("T")
 R = TypeVar("R")
 
-_THREADS = 8
+_REQUESTS = 16
+"""To an object store at once."""
+
 _ROWS_FOR_THREADS = 100_000
 """Rows of one file of which several columns are decoded at once."""
 
@@ -88,7 +91,7 @@ class Files:
 
     def records(self, names: Sequence[str]) -> list[Entry]:
         """The files of all these imports."""
-        in_threads(self.record, [name for name in names if name not in self._records])
+        self._in_threads(self.record, [name for name in names if name not in self._records])
         return [one for name in names for one in self.record(name)]
 
     def table(self, path: str) -> Any:
@@ -124,7 +127,7 @@ class Files:
         entries = [entries[number] for number in chosen]
         spans: list[tuple[int, int]] = []
         places: list[tuple[int, int]] = []
-        in_threads(self.footer, [one for one in entries if one.path not in self._footers])
+        self._in_threads(self.footer, [one for one in entries if one.path not in self._footers])
         for number, entry in enumerate(entries):
             footer = self.footer(entry)
             column = footer.schema.names.index("stamp")
@@ -154,7 +157,11 @@ class Files:
 
     def read_all(self, groups: Sequence[Groups], columns: Sequence[str] | None = None) -> list[Any]:
         """The rows of each of ``groups``."""
-        return in_threads(lambda one: self.read(one, columns), groups)
+        return self._in_threads(lambda one: self.read(one, columns), groups)
+
+    def _in_threads(self, call: Callable[[T], R], arguments: Sequence[T]) -> list[R]:
+        """``in_threads``, with more of them for an object store, which takes a while for each file."""
+        return in_threads(call, arguments, None if self.store.is_local else _REQUESTS)
 
     def read(self, groups: Groups, columns: Sequence[str] | None = None) -> Any:
         """The rows of ``groups``, a pyarrow.Table; of ``columns`` those that the file has."""
@@ -200,13 +207,12 @@ def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) 
     return np.flatnonzero(is_needed).tolist()
 
 
-def in_threads(call: Callable[[T], R], arguments: Sequence[T]) -> list[R]:
-    """The results of ``call`` for each argument, in their order.
+def in_threads(call: Callable[[T], R], arguments: Sequence[T], threads: int | None = None) -> list[R]:
+    """The results of ``call`` for each argument, in their order, by so many ``threads``.
 
-    Several are computed at once: an object store takes a while for each file, and Parquet is decoded without
-    the lock of the interpreter.
+    By default there is one for each processor: Parquet is decoded without the lock of the interpreter.
     """
     if len(arguments) < 2:
         return [call(one) for one in arguments]
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         return list(pool.map(call, arguments))
