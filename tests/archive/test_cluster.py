@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from archive.test_archive import MIDNIGHT, assert_same_lookups, tour
@@ -68,7 +69,23 @@ def test_ray_gives_the_poses_of_one_process_though_a_worker_is_killed(tmp_path: 
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert "2 nodes, one worker killed" in ended.stdout
-    table = pq.read_table(output)
+    assert_same_poses(url, pq.read_table(output))
+
+
+@pytest.mark.timeout(600)
+def test_dask_gives_the_poses_of_one_process_from_processes_of_its_own(tmp_path: Path):
+    tour(tmp_path / "r.mcap", MIDNIGHT - 5 * S, MIDNIGHT + 5 * S)
+    url, output = str(tmp_path / "a"), str(tmp_path / "poses.parquet")
+    import_recording(url, tmp_path / "r.mcap")
+    command = [python(), str(HELPERS / "dask_poses.py"), url, "world", "tip", output]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "2 partitions, in other processes" in ended.stdout  # one for each date
+    assert_same_poses(url, pq.read_table(output))
+
+
+def assert_same_poses(url: str, table: pa.Table) -> None:
+    """The poses of all rows of the archive, as it looks them up."""
     stamps = table.column("stamp").to_numpy()
     assert stamps.tolist() == list(range(MIDNIGHT - 5 * S, MIDNIGHT + 5 * S, 20 * MS))
     expected, valid = Archive(url).lookup_many("world", "tip", stamps, robot="arm")

@@ -22,12 +22,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.archive.files import Entry, Files, Groups, Stamps
+from zstate.archive.files import Entry, Files, Groups, Stamps, in_threads
 from zstate.archive.layout import EDGES, JOINTS, PARTS, POSE, SUFFIX, WRITERS, folder_of, value_of
 from zstate.archive.scene import Scene, Track
 from zstate.archive.storage import Store, arrow
@@ -43,8 +43,14 @@ from zstate.wire.native import decode
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
-_MAX_ROWS = 600_000
-"""Samples of one track in memory at once in ``lookup_many``, unless one stamp needs more."""
+_MAX_ROWS = 300_000
+"""Samples of one track in memory of one thread of ``lookup_many``, unless one stamp needs more."""
+
+_STAMPS = 1 << 15
+"""Stamps looked up at once, whose poses stay in the processor's cache."""
+
+Needed: TypeAlias = Mapping[Track, set[str]]
+"""The tracks that lookups read, and of joints the coordinates."""
 
 _LOOKED_UP = (JOINTS, PARTS, EDGES)
 
@@ -94,6 +100,13 @@ class _Segment(NamedTuple):
         return found
 
 
+class _Part(NamedTuple):
+    """The ``rows`` of instants, and the row groups around these."""
+
+    rows: slice
+    groups: Mapping[Track, Sequence[Groups]]
+
+
 class Archive:
     """The archive ``url``: a folder, or ``s3://BUCKET/PREFIX`` and the other schemes of pyarrow.fs.
 
@@ -126,8 +139,11 @@ class Archive:
         """What each recording has of ``robot``, by the first stamp."""
         self._check_robot(robot)
         found: list[Coverage] = []
-        for name in self._imports_of(robot):
-            entries = [one for one in self._files.record(name) if one.robot == robot]
+        by_import: dict[str, list[Entry]] = {}
+        for one in self._files.records(self._imports_of(robot)):
+            if one.robot == robot:
+                by_import.setdefault(one.name, []).append(one)
+        for entries in by_import.values():
             if entries:
                 rows: Counter[str] = Counter()
                 for one in entries:
@@ -198,7 +214,9 @@ class Archive:
         joints only those between the two frames. Raises UnknownFrame, AmbiguousFrame and Disconnected.
         """
         self._check_robot(robot)
-        instants, rows = np.unique(check_stamps(stamps), return_inverse=True)
+        instants, order = check_stamps(stamps), None
+        if not (np.diff(instants) > 0).all():
+            instants, order = np.unique(instants, return_inverse=True)
         poses, valid = np.full((len(instants), 7), np.nan), np.zeros(len(instants), np.bool_)
         if not len(instants):
             return poses, valid
@@ -214,13 +232,22 @@ class Archive:
                 continue
             is_known = True
             chosen = {track: tracks.get(track, []) for track in needed}
-            for part, filled in self._parts(segment, chosen, needed, instants):
-                found, is_found = filled.lookup_many(target, source, instants[part])
-                poses[part][is_found] = found[is_found]
-                valid[part] |= is_found
+
+            def look_up(part: _Part, segment: _Segment = segment, needed: Needed = needed) -> None:
+                filled = self._filled(segment, part.groups, needed)
+                for start in range(part.rows.start, part.rows.stop, _STAMPS):
+                    rows = slice(start, min(start + _STAMPS, part.rows.stop))
+                    found, is_found = filled.lookup_many(target, source, instants[rows])
+                    if is_found.all():
+                        poses[rows], valid[rows] = found, True
+                    else:
+                        poses[rows][is_found] = found[is_found]
+                        valid[rows] |= is_found
+
+            in_threads(look_up, self._parts(chosen, instants))
         if failure is not None and not is_known:
             raise failure
-        return poses[rows], valid[rows]
+        return (poses, valid) if order is None else (poses[order], valid[order])
 
     def messages(self, robot: str, stream: str, start: int, end: int) -> Iterator[ArchivedMessage]:
         """The messages of ``stream`` of ``robot`` with stamps in ``[start, end)`` [ns], as recorded.
@@ -258,7 +285,7 @@ class Archive:
         return [name.removesuffix(SUFFIX) for name in names]
 
     def _check_robot(self, robot: str) -> None:
-        if not set(self._imports_of(robot)).intersection(self._files.imports()):
+        if not any(map(self._files.is_complete, self._imports_of(robot))):
             known = ", ".join(map(repr, self.robots())) or "none"
             raise InvalidInput(f"the archive {self.url!r} has no robot {robot!r}; its robots: {known}")
 
@@ -306,14 +333,9 @@ class Archive:
         group = footer.row_group(0)
         return group.column(footer.schema.names.index("parent")).statistics.min
 
-    def _parts(
-        self,
-        segment: _Segment,
-        chosen: Mapping[Track, Sequence[Entry]],
-        needed: Mapping[Track, set[str]],
-        instants: Stamps,
-    ) -> Iterator[tuple[slice, TransformBuffer]]:
-        """Consecutive ``instants`` with a buffer around them, as many at once as fit into memory."""
+    def _parts(self, chosen: Mapping[Track, Sequence[Entry]], instants: Stamps) -> list[_Part]:
+        """Consecutive ``instants`` with the row groups around them, as many at once as fit into memory."""
+        found: list[_Part] = []
         waiting = [slice(0, len(instants))]
         while waiting:
             part = waiting.pop()
@@ -325,14 +347,15 @@ class Archive:
             if rows > _MAX_ROWS and len(stamps) > 1:
                 middle = (part.start + part.stop) // 2
                 waiting += [slice(middle, part.stop), slice(part.start, middle)]
-                continue
-            yield part, self._filled(segment, groups, needed)
+            else:
+                found.append(_Part(part, groups))
+        return found
 
     def _filled(
         self,
         segment: _Segment,
         groups: Mapping[Track, Sequence[Groups]],
-        needed: Mapping[Track, set[str]] | None,
+        needed: Needed | None,
     ) -> TransformBuffer:
         """A buffer with the samples of ``groups``; of joints only the positions ``needed``, if given."""
         filled = segment.scene.buffer(())
@@ -364,7 +387,7 @@ class Archive:
         """The rows of ``groups`` by ascending stamps, each stamp once; None without any."""
         pa = arrow()
         ordered = sorted(groups, key=lambda one: (one.entry.recorded, one.entry.name, one.entry.first))
-        tables = [self._files.read(one, columns) for one in ordered]
+        tables = self._files.read_all(ordered, columns)
         if not tables:
             return None
         table = pa.concat_tables(tables, promote_options="default")

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +17,21 @@ from zstate.archive.layout import (
     IMPORTS,
     SUFFIX,
     check_version,
-    date_of,
+    cuts_by_date,
     folder_of,
     value_of,
 )
 from zstate.archive.storage import Store, arrow
 
 Stamps = NDArray[np.int64]
+T = TypeVar("T")
+R = TypeVar("R")
+
+_REQUESTS = 16
+"""To an object store at once."""
+
+_ROWS_FOR_THREADS = 100_000
+"""Rows of one file of which several columns are decoded at once."""
 
 
 class Entry(NamedTuple):
@@ -65,23 +75,31 @@ class Files:
         """The names of all complete imports."""
         return [name.removesuffix(SUFFIX) for name in self.store.names(folder_of(IMPORTS))]
 
+    def is_complete(self, name: str) -> bool:
+        """Whether the import ``name`` is complete."""
+        return self.store.has(f"{folder_of(IMPORTS)}/{name}{SUFFIX}")
+
     def record(self, name: str) -> tuple[Entry, ...]:
         """The files of the import ``name``; none if it is not complete."""
         if name not in self._records:
-            path = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
-            if not self.store.has(path):
+            if not self.is_complete(name):
                 return ()
-            rows = self.table(path).to_pylist()
+            rows = self.table(f"{folder_of(IMPORTS)}/{name}{SUFFIX}").to_pylist()
             known = Entry._fields[1:]
             self._records[name] = tuple(Entry(name, *(row[field] for field in known)) for row in rows)
         return self._records[name]
+
+    def records(self, names: Sequence[str]) -> list[Entry]:
+        """The files of all these imports."""
+        self._in_threads(self.record, [name for name in names if name not in self._records])
+        return [one for name in names for one in self.record(name)]
 
     def table(self, path: str) -> Any:
         """A table that fits into memory, a pyarrow.Table."""
         with self.store.opened(path) as file:
             opened = arrow().parquet.ParquetFile(file, page_checksum_verification=True)
             check_version(opened.metadata.metadata, self.store.where(path))
-            return opened.read()
+            return opened.read(use_threads=False)
 
     def dates(self, stream: str, robot: str) -> list[str]:
         """The dates with samples of a robot."""
@@ -89,8 +107,7 @@ class Files:
 
     def around(self, robot: str, streams: Iterable[str], stamps: Stamps) -> list[Entry]:
         """All files of the imports with files on the dates of ascending ``stamps``, or next to these."""
-        days = np.unique(stamps // (86_400 * 10**9)).tolist()
-        wanted = np.array([date_of(int(day) * 86_400 * 10**9) for day in days])
+        wanted = np.array([day for day, _ in cuts_by_date(stamps)])
         names: set[str] = set()
         for stream in streams:
             dates = np.array(self.dates(stream, robot), str)
@@ -99,7 +116,7 @@ class Files:
             for number in sorted(one for one in chosen if 0 <= one < len(dates)):
                 files = self.store.names(folder_of(stream, robot, str(dates[number])))
                 names |= {file.partition(".")[0] for file in files if file.endswith(SUFFIX)}
-        return [one for name in sorted(names) for one in self.record(name) if one.robot == robot]
+        return [one for one in self.records(sorted(names)) if one.robot == robot]
 
     def groups(self, entries: Sequence[Entry], stamps: Stamps, *, between: bool) -> list[Groups]:
         """The row groups of files of one key with the samples around each of ascending ``stamps``.
@@ -110,6 +127,7 @@ class Files:
         entries = [entries[number] for number in chosen]
         spans: list[tuple[int, int]] = []
         places: list[tuple[int, int]] = []
+        self._in_threads(self.footer, [one for one in entries if one.path not in self._footers])
         for number, entry in enumerate(entries):
             footer = self.footer(entry)
             column = footer.schema.names.index("stamp")
@@ -137,15 +155,29 @@ class Files:
             self._footers[entry.path] = footer
         return self._footers[entry.path]
 
+    def read_all(self, groups: Sequence[Groups], columns: Sequence[str] | None = None) -> list[Any]:
+        """The rows of each of ``groups``."""
+        return self._in_threads(lambda one: self.read(one, columns), groups)
+
+    def _in_threads(self, call: Callable[[T], R], arguments: Sequence[T]) -> list[R]:
+        """``in_threads``, with more of them for an object store, which takes a while for each file."""
+        return in_threads(call, arguments, None if self.store.is_local else _REQUESTS)
+
     def read(self, groups: Groups, columns: Sequence[str] | None = None) -> Any:
         """The rows of ``groups``, a pyarrow.Table; of ``columns`` those that the file has."""
         footer = self.footer(groups.entry)
         with self.store.opened(groups.entry.path) as file:
-            opened = arrow().parquet.ParquetFile(file, metadata=footer, page_checksum_verification=True)
+            opened = arrow().parquet.ParquetFile(
+                file,
+                metadata=footer,
+                page_checksum_verification=True,
+                pre_buffer=not self.store.is_local,  # then one request reads what is close together
+            )
             if columns is not None:
                 known = opened.schema_arrow.names
                 columns = [name for name in columns if name in known]
-            return opened.read_row_groups(groups.numbers, columns=columns)
+            is_large = groups.rows >= _ROWS_FOR_THREADS
+            return opened.read_row_groups(groups.numbers, columns=columns, use_threads=is_large)
 
 
 def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) -> list[int]:
@@ -153,20 +185,34 @@ def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) 
     if not spans or not len(stamps):
         return []
     firsts, lasts = np.array(spans, np.int64).T
+    starts, ends = stamps.searchsorted(firsts), stamps.searchsorted(lasts, "right")
     if between:
         is_needed = (firsts <= stamps[-1]) & (lasts >= stamps[0])
-        stamps = stamps[[0, -1]]
+        alone = stamps[[0, -1]]
     else:
-        is_needed = stamps.searchsorted(firsts) < stamps.searchsorted(lasts, "right")
+        is_needed, alone = starts < ends, stamps
     by_first, by_last = np.argsort(firsts, kind="stable"), np.argsort(lasts, kind="stable")
     overlap = (firsts[by_first][1:] <= np.maximum.accumulate(lasts[by_first])[:-1]).any()
-    alone = stamps
-    if not overlap:
-        place = firsts[by_first].searchsorted(stamps, "right") - 1
-        inside = (place >= 0) & (stamps <= lasts[by_first][place])
-        alone = stamps[~inside]
+    if not overlap and not between:  # stamps inside of a span need no other one
+        gaps = zip([0, *ends[by_first].tolist()], [*starts[by_first].tolist(), len(stamps)], strict=True)
+        alone = np.concatenate([stamps[start:end] for start, end in gaps])
+    elif not overlap:
+        place = firsts[by_first].searchsorted(alone, "right") - 1
+        inside = (place >= 0) & (alone <= lasts[by_first][place])
+        alone = alone[~inside]
     before = lasts[by_last].searchsorted(alone, "right") - 1
     after = firsts[by_first].searchsorted(alone)
     is_needed[by_last[before[before >= 0]]] = True
     is_needed[by_first[after[after < len(firsts)]]] = True
     return np.flatnonzero(is_needed).tolist()
+
+
+def in_threads(call: Callable[[T], R], arguments: Sequence[T], threads: int | None = None) -> list[R]:
+    """The results of ``call`` for each argument, in their order, by so many ``threads``.
+
+    By default there is one for each processor: Parquet is decoded without the lock of the interpreter.
+    """
+    if len(arguments) < 2:
+        return [call(one) for one in arguments]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        return list(pool.map(call, arguments))

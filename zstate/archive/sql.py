@@ -51,8 +51,10 @@ def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
             f"SQL needs duckdb, which cannot be loaded ({error}): pip install 'zstate[archive]'"
         ) from None
     connection = duckdb.connect()
-    for name, table in (("files", IMPORTS), ("models", MODELS)):
+    for name, table in (("listed", IMPORTS), ("models", MODELS)):
         _add_view(connection, store, name, [file.path for file in store.files(folder_of(table))])
+    if store.names(folder_of(IMPORTS)):  # read once, here: there are as many small files as imports
+        connection.execute("CREATE TABLE files AS SELECT * FROM listed; DROP VIEW listed")
     complete = _Complete.read(connection, store)
     for name, table in (("frames", FRAMES), ("writers", WRITERS)):
         _add_view(connection, store, name, complete.of_table(store, table))
