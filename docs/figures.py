@@ -664,7 +664,7 @@ def streams() -> Figure:
     figure = Figure(720, 200, "A stream of another package in all tools")
     figure.box(20, 62, (170, 76), "your package\na message class,\na Stream, a Plugin", "fb")
     figure.arrow((190, 100), (268, 100), "entry point")
-    figure.box(270, 62, (150, 76), "zstate.plugins\nrows of all streams", "box")
+    figure.box(270, 62, (150, 76), "stream_registry\nrows of all streams", "box")
     rows = (
         "StreamPublisher, StreamListener",
         "zstate ls, hz, echo, graph, monitor",

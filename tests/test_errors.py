@@ -192,7 +192,6 @@ def one_of_each() -> list[errors.ZStateError]:
         errors.Unreachable("text", endpoints=("tcp/127.0.0.1:1",)),
         errors.AccessDenied("text", reason="wrong CA", endpoint="tls/127.0.0.1:1"),
         errors.PortBusy("text", endpoint="tcp/127.0.0.1:1"),
-        errors.RecordingError("text", path="run.mcap"),
         errors.UnknownFrame("a", "b", name="b", near_misses=("bb",)),
         errors.Stale("a", "b", age_s=2.0, max_age_s=1.0, edge=("a", "b")),
         late,
@@ -243,7 +242,6 @@ def one_of_each() -> list[ZStateError]:
         errors.ClockMismatch(
             "a", "b", edges=(("a", "m"), ("m", "b")), robots=("r1", "r2"), domains=("sim", "system")
         ),
-        errors.RecordingError("no", path="a.mcap"),
         errors.Unreachable("no", endpoints=["tcp/a:1"]),
         errors.AccessDenied("no", reason="wrong CA", endpoint="tcp/a:1"),
         errors.NoClock("no", waited_s=1.0),

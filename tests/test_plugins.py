@@ -15,10 +15,10 @@ from helpers.plugins import BATTERY_FOLDER, forget_plugins
 from helpers.processes import repeated, until
 from helpers.prometheus_text import collected, row
 
-from zstate import StreamListener, StreamPublisher, plugins
+from zstate import StreamListener, StreamPublisher, other_plugins, stream_registry
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.metrics.collectors import add_publishers, add_writers
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session
 from zstate.streams import Stream
 from zstate.wire.identity import WriterId
@@ -317,8 +317,8 @@ def test_a_plugin_that_cannot_be_used_is_reported_once_and_costs_no_other_one_an
     code, problem = BROKEN[name]
     install(installed, "zstate-broken", code)
     for _ in range(2):
-        assert plugins.stream_named("battery").summary == "voltage and charge of a battery"
-        assert plugins.find_stream("leak") is None
+        assert stream_registry.stream_named("battery").summary == "voltage and charge of a battery"
+        assert stream_registry.find_stream("leak") is None
     assert len([record for record in caplog.records if problem in record.getMessage()]) == 1
     ended = run_cli("plugins")
     assert ended.code == 1
@@ -334,14 +334,14 @@ def test_of_two_that_bring_one_name_both_are_named_and_zstate_itself_wins(instal
         "ROWS = (Stream('battery', StampedMessage), Stream('imu', StampedMessage))\n"
         "PLUGIN = Plugin('other', streams=ROWS, commands={'battery': 'x:y', 'tf': 'x:y'})",
     )
-    other = next(one for one in plugins.found_plugins() if one.distribution == "zstate-other")
+    other = next(one for one in other_plugins.found_plugins() if one.distribution == "zstate-other")
     assert other.plugin.streams == ()
     assert "the stream 'battery' of zstate-other is not used: zstate-battery brings one" in other.problem
     assert "the stream 'imu' of zstate-other is not used: zstate brings one" in other.problem
     assert "the command 'battery' of zstate-other is not used: zstate-battery brings one" in other.problem
     assert "zstate brings one of that name" in " ".join(run_cli("plugins").stdout.split())
     assert run_cli("tf", "--help").stdout.startswith("Usage: zstate tf")
-    assert plugins.stream_named("imu").type.__name__ == "Imu"
+    assert stream_registry.stream_named("imu").type.__name__ == "Imu"
 
 
 def test_a_command_that_cannot_be_loaded_is_an_error_with_its_package(installed: Path):

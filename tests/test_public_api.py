@@ -38,7 +38,7 @@ SIGNATURES = {
     "StatePublisher": (
         "(session, model, robot=None, wires=('native',), *, "
         "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='', "
-        "takeover=False, cache_s=2.0)"
+        "takeover=False, cache_s=2.0, pinocchio_on_demand=False)"
     ),
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",

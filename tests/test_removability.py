@@ -31,10 +31,17 @@ for name in modules_of(zstate):
     import_module(name)
 for name in [name for name in sys.modules if name.partition(".")[0] == "zstate"]:
     del sys.modules[name]
-for folder in sys.argv[1:]:
-    if not os.fork():
-        break
-    os.wait()
+folders = sys.argv[1:]
+running = 0
+while folders or running:
+    if folders and running < 4:  # they wait more than they compute
+        folder = folders.pop()
+        if not os.fork():
+            break
+        running += 1
+    else:
+        os.wait()
+        running -= 1
 else:
     sys.exit()
 removed = f"zstate.{folder}"

@@ -23,7 +23,7 @@ from zstate.driving import DriverReport, Limits, Outcome, Setpoint
 from zstate.driving.driver_state import Spread
 from zstate.ingest.counters import ListenerStats
 from zstate.model.load import load_model
-from zstate.net.presence import RobotInfo
+from zstate.net.discovery import RobotInfo
 from zstate.nodes.publisher_status import PublisherStats, StreamStats
 from zstate.odometry import (
     Ackermann,

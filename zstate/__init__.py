@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         LookupFailed,
         ModelError,
         NoData,
-        RecordingError,
         SecondWriter,
         Stale,
         UnknownFrame,
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from zstate.model.kinematics import Kinematics
     from zstate.model.load import load_model
     from zstate.model.robot import RobotModel
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.net.session import connect
     from zstate.nodes.clock import ClockPublisher, SimulatedClock
     from zstate.nodes.listener import TransformListener
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from zstate.nodes.stream_listener import StreamListener
     from zstate.nodes.stream_publisher import StreamPublisher
     from zstate.nodes.transform_publisher import TransformPublisher
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder
     from zstate.recording.recording import Recording
     from zstate.sources import JointReading, JointStateListener, SineSource
@@ -111,6 +111,7 @@ _HOMES = {
     "PartialStatePublisher": "nodes.partial_publisher",
     "Recorder": "recording.recorder",
     "Recording": "recording.recording",
+    "RecordingError": "recording.errors",
     "RobotModel": "model.robot",
     "SimulatedClock": "nodes.clock",
     "SineSource": "sources",
@@ -124,7 +125,7 @@ _HOMES = {
     "TransformPublisher": "nodes.transform_publisher",
     "Twist": "transform",
     "connect": "net.session",
-    "discover": "net.presence",
+    "discover": "net.discovery",
     "kernel": "extension",
     "load_model": "model.load",
 }

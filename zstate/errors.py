@@ -1,4 +1,4 @@
-"""Every exception of zstate, as one tree::
+"""The exceptions of zstate, as one tree::
 
  ZStateError
  ├── InvalidInput (ValueError)          an unusable argument; nothing was changed
@@ -10,10 +10,6 @@
  ├── LibraryMissing (ImportError)       a library to install first
  ├── MessageError (ValueError)          a payload that cannot be decoded           .reason
  ├── SecondWriter                       another writer is active already           .first .robot .stream .edge
- ├── DriverFault                        a driver that failed too often, and stopped   .robot
- ├── MotionRefused                      a motion that a driver must not make       .findings
- ├── MotionTimeout (TimeoutError)       a motion that is still under way           .progress
- ├── RecordingError                     a file that cannot be read or written      .path
  ├── NetworkError                       Zenoh reports a failure
  │   ├── Unreachable (TimeoutError)     no answer from the endpoints               .endpoints
  │   ├── AccessDenied                   the endpoint rejects this session          .reason .endpoint
@@ -31,6 +27,7 @@
      ├── Stale                          too old for max_age_s, or silent           .age_s .max_age_s .other
      └── NotFinite                      numbers too large to compute with
 
+Those of plugins are also ZStateErrors: ``zstate.RecordingError``, and those in ``zstate.driving``.
 A wait that times out raises the last reason for waiting, as a subclass that is also
 ``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.
 """
@@ -250,41 +247,6 @@ class SecondWriter(ZStateError):
     ) -> None:
         super().__init__(message)
         self.robot, self.stream, self.first, self.edge = robot, stream, first, edge
-
-
-class DriverFault(ZStateError):
-    """The driver of ``robot`` failed too often in a row; it was stopped, and stays so until a release."""
-
-    def __init__(self, message: str, *, robot: str) -> None:
-        super().__init__(message)
-        self.robot = robot
-
-
-class MotionRefused(ZStateError):
-    """A driver has refused a motion; nothing moves by it. ``findings`` are all reasons."""
-
-    def __init__(self, robot: str, findings: Sequence[str]) -> None:
-        self.findings = tuple(map(printable, findings))
-        count = f"{len(self.findings)} finding{'s' if len(self.findings) != 1 else ''}"
-        super().__init__(
-            "\n  ".join((f"the driver of {robot!r} refuses the motion ({count})", *self.findings))
-        )
-
-
-class MotionTimeout(ZStateError, TimeoutError):
-    """A motion is still under way after the time to wait; ``progress`` is 0 to 1."""
-
-    def __init__(self, message: str, *, progress: float) -> None:
-        super().__init__(message)
-        self.progress = progress
-
-
-class RecordingError(ZStateError):
-    """A recording that cannot be read or written; ``path`` is the file or folder at fault."""
-
-    def __init__(self, message: str, *, path: str) -> None:
-        super().__init__(message)
-        self.path = path
 
 
 class LookupFailed(ZStateError):

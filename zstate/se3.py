@@ -207,29 +207,3 @@ def unstack(poses: ArrayLike) -> Pose:
     """Poses (..., 7) as seven component arrays."""
     array = np.asarray(poses, dtype=np.float64)
     return tuple(array[..., k] for k in range(7))  # type: ignore[return-value]
-
-
-def carry_covariance(covariance: NDArray[np.float64], q: Quaternion, arm: Vector) -> NDArray[np.float64]:
-    """The covariance that an uncertain pose adds to a product of poses: (6, 6).
-
-    The error of a pose of c in p is a displacement d [m] of c's origin, and a turn w [rad] about it, both in
-    the axes of p: ``t + d`` and ``exp(w) R``. In ``a_from_b = a_from_p @ p_from_c @ c_from_b``, with the
-    rotation q of a_from_p and ``arm`` from c's origin to b's in the axes of a, b turns by ``q w`` about c's
-    origin, to first order: its own error is ``(q d - arm x q w, q w)``. So the covariance is J S J^T with
-
-        J = [[Q, -[arm]x Q], [0, Q]],
-
-    the adjoint of the rigid motion (Q, -arm). The error of p_from_c moves a against b as much as b against a,
-    with the other sign, which a square does not show: where a path goes through the edge from c to p, q and
-    arm are the same, those of a_from_p and from c's origin to b's. In particular the inverse c_from_p has
-    the q of c_from_p, and the arm from c's origin to p's in the axes of c. Covariances of independent errors
-    add. R. Smith, M. Self, P. Cheeseman, "Estimating Uncertain Spatial Relationships in Robotics" (1990);
-    T. Barfoot, P. Furgale, "Associating Uncertainty With Three-Dimensional Poses" (2014), to second order
-    in the errors, with the twist ``(d + t x w, w)`` of the same error.
-    """
-    turn = to_matrix((0.0, 0.0, 0.0, *q))[:3, :3]
-    x, y, z = arm
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = turn
-    jacobian[:3, 3:] = np.array(((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))) @ turn
-    return jacobian @ covariance @ jacobian.T

@@ -1,7 +1,8 @@
 """Streams: all that is true of one, once, in a row that every tool reads.
 
 The rows here are those of the core. Plugins have rows of their own: those of zstate in the ``plugin``
-module of their folder, those of other packages where their entry point leads. ``zstate.plugins`` finds them.
+module of their folder, those of other packages where their entry point leads. ``zstate.stream_registry``
+finds them.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from zstate import se3
-from zstate._util.format import html_table
 from zstate.checks import QUATERNION_TOLERANCE, check_names, real_numbers
 from zstate.clock import Clock, check_stamp, format_stamp
 from zstate.errors import FrameMismatch, InvalidInput, LibraryMissing, format_duration
@@ -252,12 +251,14 @@ class Transform(TransformFields):
         (geometry_msgs/PoseWithCovariance). A lookup has one if samples of the path have it, an inverse if its
         transform has, and a product if one factor has and the other has, too, or is of kind "static", which
         is exact. The factors' errors are taken as independent, and the result is of first order in them
-        (``se3.carry_covariance``): right for rotations uncertain by a few tenths of a radian at most.
+        (``zstate.covariance``): right for rotations uncertain by a few tenths of a radian at most.
         """
         return None
 
     def with_covariance(self, covariance: ArrayLike) -> Transform:
         """The same transform with a covariance, (6, 6). Raises InvalidInput unless it can be one."""
+        from zstate.covariance import check_covariance  # noqa: PLC0415 - of transforms that have one
+
         return PoseWithCovariance.of_pose(self, check_covariance(covariance))
 
     @property
@@ -301,7 +302,9 @@ class Transform(TransformFields):
         covariance = self.covariance
         if covariance is None:
             return inverse
-        carried = se3.carry_covariance(covariance, pose[3:], pose[:3])
+        from zstate.covariance import carry_covariance  # noqa: PLC0415 - as above
+
+        carried = carry_covariance(covariance, pose[3:], pose[:3])
         return PoseWithCovariance.of_pose(inverse, carried[UPPER_TRIANGLE].tolist())
 
     @overload  # a Transform is ArrayLike, too; its product is not that of its matrix
@@ -333,25 +336,16 @@ class Transform(TransformFields):
             combine_kinds(self.kind, other.kind),
             max(self.predicted_s, other.predicted_s),
         )
-        covariance = self._covariance_of_product(other)
-        if covariance is None:
-            return product
-        return PoseWithCovariance.of_pose(product, covariance[UPPER_TRIANGLE].tolist())
-
-    def _covariance_of_product(self, other: Transform) -> Array | None:
-        """The covariance of ``self @ other``, None if it is not known."""
         first, second = self.covariance, other.covariance
         is_unknown = (first is None and self.kind != "static") or (second is None and other.kind != "static")
         if is_unknown or (first is None and second is None):
-            return None
+            return product
+        from zstate.covariance import product_covariance  # noqa: PLC0415 - as above
+
         rotation: se3.Quaternion = self._pose[3:]  # type: ignore[assignment]
-        total = np.zeros((6, 6))
-        if first is not None:
-            arm = se3.rotate(rotation, other._pose[:3])  # type: ignore[arg-type]
-            total += se3.carry_covariance(first, se3.IDENTITY[3:], arm)
-        if second is not None:
-            total += se3.carry_covariance(second, rotation, (0.0, 0.0, 0.0))
-        return total
+        arm = se3.rotate(rotation, other._pose[:3])  # type: ignore[arg-type]
+        covariance = product_covariance(first, second, rotation, arm)
+        return PoseWithCovariance.of_pose(product, covariance[UPPER_TRIANGLE].tolist())
 
     def _apply_to_points(self, points: object) -> Array:
         if not (isinstance(points, (list, tuple)) or hasattr(points, "__array__")):
@@ -437,6 +431,8 @@ class Transform(TransformFields):
         )
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_table  # noqa: PLC0415 - for notebooks alone
+
         rows = [
             ("translation xyz [m]", _vector_text(self.translation)),
             ("rotation xyzw", _vector_text(self.rotation)),
@@ -484,35 +480,6 @@ class PoseWithCovariance(Transform):
     def __reduce__(self) -> tuple[Any, ...]:
         pose = Transform.trusted(*super().__reduce__()[1])
         return (PoseWithCovariance.of_pose, (pose, self._known_triangle()))
-
-
-def check_covariance(
-    covariance: ArrayLike, what: str = "the covariance of a pose", size: int = 6
-) -> list[float]:
-    """The upper triangle of a covariance, (size, size): 21 numbers row by row of a pose.
-
-    Raises InvalidInput unless it is finite, symmetric within 1e-6 of its largest number, and positive
-    semidefinite.
-    """
-    matrix = real_numbers(covariance, what)
-    if matrix.shape != (size, size):
-        raise InvalidInput(f"{what} has shape ({size}, {size}); got {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise InvalidInput(f"{what} must be finite; leave it out if it is not known")
-    tolerance = 1e-6 * float(np.abs(matrix).max())
-    if np.abs(matrix - matrix.T).max() > tolerance:
-        row, column = np.unravel_index(np.abs(matrix - matrix.T).argmax(), (size, size))
-        raise InvalidInput(
-            f"{what} is symmetric; got {matrix[row, column]:g} in row {row}, column "
-            f"{column}, and {matrix[column, row]:g} in row {column}, column {row}"
-        )
-    smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if smallest < -tolerance:
-        raise InvalidInput(
-            f"{what} has no negative eigenvalue; got {smallest:g}. Variances (the diagonal, in squares of "
-            "units) are not negative, and limit the covariances in their row"
-        )
-    return matrix[np.triu_indices(size)].tolist()
 
 
 def _frozen(numbers: ArrayLike) -> Array:

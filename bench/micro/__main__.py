@@ -23,7 +23,7 @@ from bench.micro.form import send_event
 NAMES = sorted(
     path.stem for path in Path(__file__).parent.glob("*.py") if path.stem[0] != "_" and path.stem != "form"
 )
-WORKERS = ("lookup_buffers", "view_urdf")
+WORKERS = ("lookup_buffers",)
 """Modules that run in the processes of another."""
 
 

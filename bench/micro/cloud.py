@@ -4,6 +4,9 @@ The lidar turns once in 0.1 s in a room of flat walls, with noise of 1 cm, on a 
 with poses at 100 Hz. Placing includes the view of the message and the instants of the points, whose order is
 that of the measurement (a column of all lasers after the other), by laser, or none. Compression is of the
 message with intensity, ring and time (22 bytes a point); errors are of x, y and z.
+
+``--points`` is a file of numpy with the points of a real sweep, a structured array as for ``CloudPublisher``;
+they are placed in their order only.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.micro.form import Call, Row, call_times_us, compared
 from zstate import Transform, TransformBuffer
@@ -26,22 +30,29 @@ START = 300 * MS
 CALLS = 3
 
 
-def measure(rounds: int = 15) -> Iterator[Row]:
+def measure(rounds: int = 15, points: str = "") -> Iterator[Row]:
     """Rows of placing, then of each compression."""
-    lidar = SimulatedLidar(noise_m=0.01, seed=1)
-    cloud = lidar.cloud(START, [pose_at(int(stamp)).pose7 for stamp in lidar.stamps(START)])
+    cloud = Cloud(START, "lidar", np.load(points)) if points else simulated()
     buffer = TransformBuffer()
     for stamp in range(0, 600 * MS, 10 * MS):
         buffer.insert(pose_at(stamp))
-    yield from compared("placed", "us", call_times_us(place_cases(cloud, buffer), rounds, CALLS))
+    cases = {"in their order": np.arange(len(cloud))} if points else orders(len(cloud))
+    if not cloud.is_rigid:
+        yield from compared("placed", "us", call_times_us(place_cases(cloud, cases, buffer), rounds, CALLS))
     messages = compressed(cloud)
     yield from compared("to a message", "us", call_times_us(encode_cases(cloud), rounds, CALLS))
     reading = {name: lambda one=one: message_points(one) for name, one in messages.items()}
     yield from compared("from a message", "us", call_times_us(reading, rounds, CALLS))
     yield from compared("size", "kB", {name: [len(one.data) / 1e3] for name, one in messages.items()})
     for name, one in messages.items():
-        error = abs(cloud_from_message(one, "r1").xyz.astype(float) - cloud.xyz).max()
+        error = np.nanmax(abs(cloud_from_message(one, "r1").xyz.astype(float) - cloud.xyz))
         yield Row(f"largest error: {name}", "mm", [1e3 * float(error)])
+
+
+def simulated() -> Cloud:
+    """A sweep of a lidar that turns with its base."""
+    lidar = SimulatedLidar(noise_m=0.01, seed=1)
+    return lidar.cloud(START, [pose_at(int(stamp)).pose7 for stamp in lidar.stamps(START)])
 
 
 def pose_at(stamp: int) -> Transform:
@@ -53,17 +64,20 @@ def pose_at(stamp: int) -> Transform:
     )
 
 
-def place_cases(cloud: Cloud, buffer: TransformBuffer) -> dict[str, Call]:
-    """Clouds of the same points in another order."""
-    count, rings = len(cloud), 128
-    orders = {
+def orders(count: int) -> dict[str, NDArray[np.intp]]:
+    """Orders of the points of a simulated sweep."""
+    return {
         "in the order of measurement": np.arange(count),
-        "laser by laser": np.arange(count).reshape(-1, rings).T.ravel(),
+        "laser by laser": np.arange(count).reshape(-1, 128).T.ravel(),
         "in no order": np.random.default_rng(1).permutation(count),
     }
+
+
+def place_cases(cloud: Cloud, cases: dict[str, NDArray[np.intp]], buffer: TransformBuffer) -> dict[str, Call]:
+    """Clouds of the same points in another order."""
     messages = {
-        name: cloud_to_message(Cloud(cloud.stamp, cloud.frame, cloud.points[order]), is_dense=True)
-        for name, order in orders.items()
+        name: cloud_to_message(Cloud(cloud.stamp, cloud.frame, cloud.points.ravel()[order]), is_dense=True)
+        for name, order in cases.items()
     }
 
     def place(message: PointCloud) -> None:

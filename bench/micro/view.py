@@ -2,26 +2,19 @@
 
 A publisher process (``zstate publish --source sine``, 100 Hz) and ``zstate view`` at 30 pictures a second,
 read by a client that receives all messages of a browser and draws nothing, since drawing happens on another
-machine. In the same run, viser's own ViserUrdf moves the same robot at 30 Hz, if its environment is
-installed:
-
-    python -m venv .bench/viser-urdf && .bench/viser-urdf/bin/pip install 'viser[urdf]>=1.1,<2' pycollada
-
-Then ten robots of 30 links at 10 Hz; the chain at 100 Hz without a view and with one; and the time from
-`zstate view panda --sliders` until an open browser (headless chromium, no graphics card) shows the robot.
+machine. Then ten robots of 30 links at 10 Hz; the chain at 100 Hz without a view and with one; and the time
+from `zstate view panda --sliders` until an open browser (headless chromium, no graphics card) shows the
+robot.
 """
 
 from __future__ import annotations
 
 import io
-import json
-import re
 import threading
 import time
 import urllib.parse
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -36,11 +29,9 @@ from websockets.typing import Subprotocol
 from bench.measure import cpu_ns
 from bench.micro.chain import run_chain
 from bench.micro.form import Row, chain_urdf, end_of_input, running_role, send_event, use_own_rendezvous
-from bench.process import START_WITHIN_S, running, running_command
-from bench.subjects.subject import venv_python
+from bench.process import running_command
 from zstate import SineSource, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import SystemClock
-from zstate.model.mesh_paths import MeshPaths
 from zstate.rate import Rate
 
 RATE_HZ = 30.0
@@ -52,12 +43,11 @@ LINK = '<visual><origin xyz="0 0 0.05"/><geometry><box size="0.04 0.04 0.1"/></g
 
 
 def measure(robots: tuple[str, ...] = ("panda", "talos"), seconds: float = 10.0) -> Iterator[Row]:
-    """Rows of the view and of ViserUrdf, of the chain, and of the first picture."""
+    """Rows of the view, of the chain, and of the first picture."""
     use_own_rendezvous()
     for robot in robots:
         with running_command("publish", robot, "--source", "sine"):
             yield from view_rows(f"{robot} at 30 Hz, zstate view", seconds, robot)
-        yield from viser_urdf_rows(f"{robot} at 30 Hz, ViserUrdf", seconds, robot)
     with running_role(publish_fleet):
         yield from view_rows(f"{FLEET} robots of {LINKS} links at {FLEET_HZ:g} Hz, zstate view", seconds)
     for is_viewed in (False, True, False, True):
@@ -79,18 +69,6 @@ def view_rows(what: str, seconds: float, *robots: str) -> Iterator[Row]:
     """The costs of `zstate view`."""
     with running_command("view", *robots, "--port", "0", text="http") as (pid, line):
         yield from page_rows(what, seconds, pid, address(line))
-
-
-def viser_urdf_rows(what: str, seconds: float, robot: str) -> Iterator[Row]:
-    """The costs of ViserUrdf; none if it is not installed."""
-    python = venv_python("viser-urdf")
-    if python is None:
-        print(f"{what}: its environment is missing")
-        return
-    with running("viser", python, str(Path(__file__).with_name("view_urdf.py"))) as process:
-        process.send_line(urdf_job(robot))
-        port = process.wait_for_event("ready", START_WITHIN_S)["port"]
-        yield from page_rows(what, seconds, process.pid, f"http://127.0.0.1:{port}")
 
 
 def page_rows(what: str, seconds: float, pid: int, url: str) -> Iterator[Row]:
@@ -141,16 +119,6 @@ CAMERA = {
     "look_at": (0.0, 0.0, 0.0),
     "up_direction": (0.0, 0.0, 1.0),
 }
-
-
-def urdf_job(robot: str) -> str:
-    """The job of ``view_urdf.py``: the URDF with absolute mesh paths, and a motion."""
-    model = load_model(robot)
-    paths = MeshPaths(None)
-    urdf = re.sub(r'(?<=filename=")[^"]+', lambda uri: str(paths.find(uri[0])), model.urdf)
-    source = SineSource(model)
-    rows = [source.read(round(tick * 1e9 / RATE_HZ)).positions.tolist() for tick in range(ROWS)]
-    return json.dumps({"urdf": urdf, "joints": model.joint_names, "rows": rows, "rate_hz": RATE_HZ})
 
 
 def publish_fleet() -> None:

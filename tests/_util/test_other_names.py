@@ -12,7 +12,8 @@ from pkgutil import resolve_name
 import pytest
 
 import zstate
-from zstate._util.other_names import TF2_CLASSES, TF2_METHODS
+from zstate._util.other_names import TF2_CLASSES
+from zstate._util.tf2_methods import TF2_METHODS
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,16 @@ from helpers.recording_builder import (
     swing_positions,
     swing_velocities,
 )
+from helpers.robots import RRBOT
 from recording.test_recording import wild
 
 from zstate import Archive, Recording, Transform, UnknownFrame
 from zstate.archive import import_recording
 from zstate.archive.cut import cut
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
 from zstate.odometry.messages import Imu
 from zstate.recording.decode import DecodedMessage
+from zstate.recording.errors import RecordingError
 from zstate.wire.messages import to_block
 
 DAY = 86_400 * S
@@ -284,3 +286,54 @@ def test_simulated_time_has_no_date_and_is_refused(tmp_path: Path):
     with pytest.raises(InvalidInput, match="simulated time has no date"):
         import_recording(str(tmp_path / "a"), tmp_path / "r.mcap")
     assert Archive(str(tmp_path / "a")).robots() == ()
+
+
+def test_robots_of_one_recording_are_imported_together_without_the_edges_of_their_models(tmp_path: Path):
+    given = next((joint.parent, joint.child) for joint in RRBOT.joints if joint.type != "fixed")
+    with RecordingBuilder(tmp_path / "r.mcap") as builder:
+        for robot in ("a", "b"):
+            builder.describe(robot)
+        for stamp in range(START, START + 2 * S, 20 * MS):
+            for number, robot in enumerate(("a", "b")):
+                angles = swing_positions((stamp - START) / S + number)
+                builder.joints(robot, stamp, angles)
+                builder.edges(robot, stamp, {given: pose(1.0)})
+                builder.edges(
+                    robot, stamp, {("odom", "world"): pose(angles[0])}, session=3, writer="odometry"
+                )
+    report = import_recording(str(tmp_path / "a"), tmp_path / "r.mcap")
+    assert (report.robots, report.rows) == (["a", "b"], {"joint_states": 200, "transforms": 200})
+    archive = Archive(str(tmp_path / "a"))
+    stamps = np.arange(START, START + 2 * S, 7 * MS)
+    for robot in archive.robots():
+        with Recording(tmp_path / "r.mcap", robot) as recording:
+            expected, valid = recording.lookup_many(f"{robot}/odom", f"{robot}/tool", stamps)
+        assert valid.any()
+        found, is_found = archive.lookup_many(f"{robot}/odom", f"{robot}/tool", stamps, robot=robot)
+        assert np.array_equal(is_found, valid)
+        assert np.array_equal(found, expected, equal_nan=True)
+
+
+def test_parts_of_a_split_recording_are_added_once_each_whichever_is_named(tmp_path: Path):
+    dice = np.random.default_rng(1)
+    with RecordingBuilder(tmp_path / "r.mcap", "arm", max_bytes=1 << 16) as builder:
+        builder.describe("arm")
+        for stamp in range(START, START + 30 * S, 10 * MS):
+            builder.joints("arm", stamp, dice.uniform(-1.0, 1.0, 2), dice.uniform(-1.0, 1.0, 2))
+    parts = sorted(tmp_path.glob("*.mcap"))
+    assert len(parts) > 1
+    url = str(tmp_path / "a")
+    assert not import_recording(url, tmp_path / "r_1.mcap").is_known
+    assert not import_recording(url, tmp_path / "r.mcap").is_known
+    assert all(import_recording(url, part).is_known for part in parts)
+    archive = Archive(url)
+    assert [one.recording for one in archive.coverage("arm")] == [
+        "r.mcap",
+        *(f"r_{number}.mcap" for number in range(1, len(parts))),
+    ]
+    with Recording(tmp_path / "r.mcap", "arm") as recording:
+        stamps = np.arange(START, START + 30 * S, 123 * MS)
+        expected, _ = recording.lookup_many("world", "tool", stamps)
+    assert np.array_equal(
+        archive.lookup_many("world", "tool", stamps, robot="arm")[0], expected, equal_nan=True
+    )

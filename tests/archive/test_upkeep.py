@@ -19,7 +19,8 @@ from zstate import Archive, Recording
 from zstate.archive import import_recording
 from zstate.archive.storage import Store
 from zstate.archive.upkeep import check, expire, forget
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.recording.errors import RecordingError
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -83,6 +84,31 @@ def test_an_import_counts_once_it_is_complete_and_a_second_one_completes_it(
 
 
 @pytest.mark.long
+def test_sql_shows_nothing_of_an_import_that_is_not_complete(tmp_path: Path, recording: Path, monkeypatch):
+    url = str(tmp_path / "a")
+    import_recording(url, recording)
+    queries = [f"SELECT count(*) FROM {name}" for name in ("joint_states", "transforms", "writers", "frames")]
+    with Archive(url).duckdb() as connection:
+        counts = [connection.sql(query).fetchall() for query in queries]
+    tour(tmp_path / "later.mcap", MIDNIGHT + S, MIDNIGHT + 2 * S, tip=0.2)
+    put = Store.put
+
+    def interrupted(store: Store, source: Path, path: str) -> None:
+        if path.startswith("imports"):
+            raise KeyboardInterrupt
+        put(store, source, path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Store, "put", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            import_recording(url, tmp_path / "later.mcap")
+    with Archive(url).duckdb() as connection:
+        assert [connection.sql(query).fetchall() for query in queries] == counts
+    import_recording(url, tmp_path / "later.mcap")
+    with Archive(url).duckdb() as connection:
+        assert connection.sql(queries[0]).fetchone()[0] == counts[0][0][0] + 50
+
+
 def test_an_import_that_is_killed_leaves_the_archive_as_it_was(tmp_path: Path, recording: Path):
     code = "import sys, zstate.archive; zstate.archive.import_recording(*sys.argv[1:])"
     url = tmp_path / "a"

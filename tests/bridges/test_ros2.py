@@ -16,7 +16,7 @@ from helpers.robots import RRBOT, STAMP, UPRIGHT
 from zstate.bridges.ros2 import Bridge
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import Received, subscribe
@@ -28,7 +28,8 @@ from zstate.odometry import OdometryPublisher
 from zstate.odometry.messages import Odometry
 from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import covariance_matrix, from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import from_block
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 

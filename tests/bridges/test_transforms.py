@@ -12,7 +12,7 @@ from helpers.robots import RRBOT, STAMP
 
 from zstate.bridges.transforms import TransformRelay, edge_writer_of_node
 from zstate.errors import Closed
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.transform_publisher import TransformPublisher

@@ -130,6 +130,19 @@ def test_scan_of_a_turning_rover_is_placed_as_looked_up(frames: tuple[str, str],
     assert assert_placed_as_looked_up(driving(), points, stamps, *frames).all()
 
 
+@pytest.mark.parametrize("columns", [1024, 9000])
+def test_irregular_stamps_that_lasers_share_are_placed_as_each_by_itself(columns: int) -> None:
+    """Of a real sensor: as many as are kept at once, and more."""
+    rng = np.random.default_rng(6)
+    stamps = np.tile(np.sort(rng.integers(NOW + S, NOW + S + 100 * MS, columns)), 4)
+    points = rng.uniform(-30.0, 30.0, (len(stamps), 3))
+    buffer = driving()
+    placed, valid = buffer.place(points, stamps, "laser", "odom")
+    expected, _ = buffer._path("odom", "laser", compiled=False).place(points, stamps)
+    assert valid.all()
+    np.testing.assert_allclose(placed, expected, rtol=0.0, atol=1e-12 * 30.0)
+
+
 @pytest.mark.parametrize("bend", [0.01, 0.1, 0.7, 3.0, 40.0])
 @pytest.mark.parametrize("order", ["ascending", "descending", "jumps"])
 def test_many_points_between_two_samples_of_any_motion_are_placed_as_looked_up(

@@ -7,7 +7,8 @@ import random
 import numpy as np
 import pytest
 
-from zstate.buffer.history import History, ReferenceHistory
+from zstate.buffer.history import History
+from zstate.buffer.reference_history import ReferenceHistory
 
 HISTORIES = pytest.mark.parametrize("make", list(dict.fromkeys([History, ReferenceHistory])))
 

@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.history import History, ReferenceHistory, insert_together
+from zstate.buffer.history import History, insert_together
 from zstate.buffer.path import CompiledPath, TransformPath
+from zstate.buffer.reference_history import ReferenceHistory
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.extension import kernel

@@ -25,7 +25,7 @@ from zstate.recording.info import read_info, recorded_robots
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
-from zstate.wire.messages import with_field
+from zstate.wire.measurements import with_field
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames
 from zstate.wire.ros2.types import COMPRESSED_VIDEO

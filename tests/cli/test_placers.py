@@ -32,7 +32,7 @@ def test_a_robot_that_is_not_among_the_placers_is_refused(command: str):
 @pytest.mark.parametrize(
     ("command", "text"),
     [
-        ("view run.mcap", "--placer is for live robots, not those of a recording"),
+        ("view run.mcap", "--placer are for live robots, not those of a recording"),
         ("plot --file run.mcap --path base tool", "--placer is for --path A B of live robots"),
         ("plot panda", "--placer is for --path A B of live robots"),
         ("monitor --robots", "--placer is for edges"),

@@ -15,7 +15,7 @@ from zstate.cli.edge_statistics import EdgeRow, EdgeStatistics, path_text
 from zstate.cli.output.drawing import ALARM, draw
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
-from zstate.net.presence import RobotInfo
+from zstate.net.discovery import RobotInfo
 from zstate.net.topic_statistics import Arrival, TopicStatistics
 from zstate.nodes.metered_buffer import MeteredBuffer
 from zstate.wire.identity import WriterId

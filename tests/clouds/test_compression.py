@@ -17,7 +17,7 @@ from zstate.clouds.cloud import Cloud, cloud_from_message, cloud_to_message
 from zstate.clouds.compression import Compression, compress, decompress
 from zstate.clouds.messages import CLOUD_BYTES, PointCloud, PointField
 from zstate.errors import InvalidInput
-from zstate.wire.messages import with_field
+from zstate.wire.measurements import with_field
 
 COMPRESSIONS = ["lz4", "zstd"]
 KIND = np.dtype(

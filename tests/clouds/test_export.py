@@ -15,7 +15,8 @@ from rosbags.highlevel import AnyReader
 from zstate import Recording
 from zstate.clouds.cloud import Cloud, cloud_from_message, cloud_to_message
 from zstate.clouds.messages import PointCloud
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.recording.errors import RecordingError
 from zstate.recording.stream_export import export_points, export_stream
 
 START = 1_700_000_000_000_000_000

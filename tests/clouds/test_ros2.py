@@ -16,7 +16,8 @@ from zstate.clouds.cloud import Cloud, cloud_from_message, cloud_to_message
 from zstate.clouds.messages import CLOUD_POINTS, PointCloud, PointField
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import Message, with_field
+from zstate.wire.measurements import with_field
+from zstate.wire.messages import Message
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options

@@ -20,13 +20,14 @@ from zstate.driving import Limits, SimulatedDriver
 from zstate.driving.commands import NO_COLUMNS, NO_POSITIONS, Command
 from zstate.driving.control_loop import ControlLoop
 from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.errors import DriverFault
 from zstate.driving.messages import JointTrajectory, MotionCancel, Release
 from zstate.driving.motion_service import plan
 from zstate.driving.setpoint_limiter import JointRate
 from zstate.driving.stops import StopRegister
 from zstate.driving.stops_file import ActiveStop
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
-from zstate.errors import DriverFault, InvalidInput, MessageError
+from zstate.errors import InvalidInput, MessageError
 from zstate.net.presence import local_writer
 from zstate.rate import Rate
 from zstate.wire.messages import to_block

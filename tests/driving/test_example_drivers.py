@@ -32,7 +32,8 @@ from models.drivers.serial_servos import SerialServos
 from zstate import TransformListener, load_model
 from zstate.driving import Calibration, Commander, DriverHost, Setpoint
 from zstate.driving.driver import Driver
-from zstate.errors import DriverFault, InvalidInput, NoData
+from zstate.driving.errors import DriverFault
+from zstate.errors import InvalidInput, NoData
 from zstate.net.session import Session
 
 ROOT = Path(__file__).parents[2]

@@ -24,9 +24,10 @@ from helpers.robots import RRBOT, SampleCollector, wait_for_reader
 from zstate import JointReading, StatePublisher, load_model
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.errors import DriverFault, MotionRefused
 from zstate.driving.messages import DriverState, JointCommand, Release
 from zstate.driving.stops import stops_file, wait_for_state
-from zstate.errors import DriverFault, InvalidInput, MotionRefused, SecondWriter, Unreachable
+from zstate.errors import InvalidInput, SecondWriter, Unreachable
 from zstate.net.presence import announce, confirmed_tokens, local_writer
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher

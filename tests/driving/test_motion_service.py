@@ -16,10 +16,11 @@ from helpers.raw_ros_nodes import COMMANDS, TRAJECTORY, RosPublisher, announced_
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.driving import Commander, DriverHost, Limits, Motion, SimulatedDriver, stop
+from zstate.driving.errors import MotionRefused, MotionTimeout
 from zstate.driving.messages import JointCommand, JointTrajectory, MotionCancel, MotionReply
 from zstate.driving.stops import wait_for_state
 from zstate.driving.trajectory import Trajectory
-from zstate.errors import InvalidInput, MotionRefused, MotionTimeout
+from zstate.errors import InvalidInput
 from zstate.fleet.acl import AclRoles
 from zstate.net.presence import local_writer
 from zstate.net.queryable import query

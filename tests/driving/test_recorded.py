@@ -15,7 +15,8 @@ from zstate.driving.recorded import (
 )
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import WriterId
-from zstate.wire.messages import message_fields, order_digest, to_block
+from zstate.wire.measurements import message_fields
+from zstate.wire.messages import order_digest, to_block
 
 STATE = DriverState(
     *(1_700_000_000_123_456_789, 2**63, "drive@desk pid 7", "stopped", '["1"] \n stopped', ("a", "b")),

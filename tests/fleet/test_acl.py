@@ -23,15 +23,16 @@ from zstate import StatePublisher, StaticPublisher, Transform, TransformListener
 from zstate.errors import AccessDenied, InvalidInput, SecondWriter
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.router_config import access_text
+from zstate.net.discovery import discover_readers
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
-from zstate.net.presence import announce, discover_readers
+from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.plugins import own_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
+from zstate.stream_registry import own_streams
 from zstate.wire import keys
 from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import encode, encoding_of

@@ -20,7 +20,7 @@ from zstate.fleet.uplink import Uplink
 from zstate.net.config import default_config
 from zstate.net.security.credentials import Credentials
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.plugins import all_streams
+from zstate.stream_registry import all_streams
 from zstate.transform import Transform
 from zstate.wire import keys as wire_keys
 from zstate.wire.keys import MODEL_WRITER, stream_key

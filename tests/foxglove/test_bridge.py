@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 from zstate.fleet.acl import AclRoles
 from zstate.foxglove.bridge import FoxgloveBridge
 from zstate.foxglove.server import SUBPROTOCOLS, FoxgloveServer, ServedMessage
-from zstate.net.presence import discover_readers
+from zstate.net.discovery import discover_readers
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

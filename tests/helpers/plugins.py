@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from zstate import plugins
+from zstate import other_plugins, stream_registry
 from zstate.streams import Stream
 from zstate.wire import native
 
@@ -23,15 +23,19 @@ def battery_installed() -> Iterator[Stream]:
         installed.setattr(sys, "path", [str(BATTERY_FOLDER), *sys.path])
         forget_plugins()
         try:
-            yield plugins.stream_named("battery")
+            yield stream_registry.stream_named("battery")
         finally:
             forget_plugins()
 
 
 def forget_plugins() -> None:
     """Forget the plugins that were found, as in a new process."""
-    plugins.found_plugins.cache_clear()
-    plugins._REGISTRY.forget()
-    for cached in (plugins.edge_streams, plugins.latched_streams, plugins.measured_streams):
+    other_plugins.found_plugins.cache_clear()
+    stream_registry._REGISTRY.forget()
+    for cached in (
+        stream_registry.edge_streams,
+        stream_registry.latched_streams,
+        stream_registry.measured_streams,
+    ):
         cached.cache_clear()
     native.encoding_of.cache_clear()

@@ -10,7 +10,8 @@ import pytest
 from helpers.robots import RRBOT, STAMP, assert_pose
 
 from zstate.buffer.buffer import TransformBuffer, feed_of
-from zstate.buffer.history import History, HistoryView
+from zstate.buffer.history import History
+from zstate.buffer.history_view import HistoryView
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest

@@ -22,7 +22,8 @@ from zstate.metrics.collectors import (
     add_writers,
 )
 from zstate.metrics.endpoint import MetricsEndpoint
-from zstate.net.presence import RobotInfo, connections, discover, local_writer
+from zstate.net.discovery import RobotInfo, connections, discover
+from zstate.net.presence import local_writer
 from zstate.net.session import connect
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener

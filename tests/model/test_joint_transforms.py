@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
-from zstate.model.joint_transforms import JointTransforms, edge_forms
+from zstate.model.joint_forms import edge_forms
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import DeclaredLimits, Joint, JointType, Mimic, RobotModel
 
 Pose = tuple[float, float, float, float, float, float, float]

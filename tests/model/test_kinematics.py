@@ -34,7 +34,7 @@ def example_urdfs() -> list[Path]:
 
 def example(name: str) -> RobotModel:
     (path,) = (path for path in example_urdfs() if path.name == name)
-    return parse_urdf(path.read_bytes(), name)
+    return parse_urdf(path.read_text(), name)
 
 
 def by_name(model: RobotModel, positions: np.ndarray) -> dict[str, np.ndarray]:
@@ -81,7 +81,7 @@ def plain_pinocchio(model: RobotModel, positions: np.ndarray) -> dict[str, np.nd
 @pytest.mark.robots
 @pytest.mark.parametrize("path", six_of(example_urdfs(), lambda path: path.stem))
 def test_poses_agree_with_pinocchios_plain_api(path: Path) -> None:
-    model = parse_urdf(path.read_bytes(), path.name)
+    model = parse_urdf(path.read_text(), path.name)
     kinematics = Kinematics(model)
     positions = random_positions(model, 1)
     expected = plain_pinocchio(model, positions)
@@ -235,7 +235,7 @@ def moving_poses(model: RobotModel, positions: np.ndarray) -> np.ndarray:
 @pytest.mark.robots
 @pytest.mark.parametrize("path", six_of(example_urdfs(), lambda path: path.stem))
 def test_moving_edges_of_every_robot_agree_with_the_closed_forms(path: Path) -> None:
-    model = parse_urdf(path.read_bytes(), path.name)
+    model = parse_urdf(path.read_text(), path.name)
     edges = MovingEdges(model)
     assert edges.engine.name.startswith("Pinocchio")
     for seed in range(3):

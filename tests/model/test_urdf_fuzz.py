@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from zstate.errors import ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.model.xml_text import decode
 
 SEED = (Path(__file__).parents[2] / "models" / "gripper.urdf").read_bytes()
 TOKENS = [
@@ -49,7 +50,7 @@ def element(children: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
 
 def parse(data: str | bytes) -> None:
     with contextlib.suppress(ModelError):
-        model = parse_urdf(data, "fuzz")
+        model = parse_urdf(data if isinstance(data, str) else decode(data, "fuzz"), "fuzz")
         assert isinstance(model, RobotModel)
         assert all(model.mimic_of(joint).joint in model.columns for joint in model.joints if joint.mimic)
         assert model.neutral.shape == (model.position_count,)

@@ -6,7 +6,9 @@ import pytest
 
 from zstate.errors import ModelError
 from zstate.model.urdf import parse_urdf
-from zstate.model.xml import read_document
+from zstate.model.xml import Document
+from zstate.model.xml import read_document as read_text
+from zstate.model.xml_text import decode
 
 SMALL = '<robot name="\u00e9"><link name="a"/></robot>'
 
@@ -15,6 +17,10 @@ LAUGHS = """<?xml version="1.0"?>
 <!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">
 ]>
 <robot name="&b;"><link name="a"/></robot>"""
+
+
+def read_document(data: str | bytes, source: str) -> Document:
+    return read_text(data if isinstance(data, str) else decode(data, source), source)
 
 
 def finding(data: str | bytes) -> tuple[int | None, str]:

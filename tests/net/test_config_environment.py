@@ -7,7 +7,7 @@ from helpers.access_routers import AccessRouters
 from helpers.processes import Child, until
 
 from zstate.errors import ConfigError, PortBusy, Unreachable
-from zstate.net.config import implied_mode
+from zstate.net.environment import implied_mode
 from zstate.net.session import connect
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 

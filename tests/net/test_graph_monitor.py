@@ -7,8 +7,8 @@ import os
 from helpers.processes import until
 from helpers.robots import RRBOT
 
+from zstate.net.discovery import RobotInfo
 from zstate.net.graph import GraphMonitor, StreamUse, build_graph
-from zstate.net.presence import RobotInfo
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.identity import Announcement, WriterId

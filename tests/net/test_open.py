@@ -11,9 +11,9 @@ import zenoh
 from helpers.processes import Child, find_free_port
 
 from zstate.errors import AccessDenied, PortBusy, Unreachable
-from zstate.net.open import connect_timeout
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
+from zstate.net.user_config import connect_timeout
 
 LONG_S = 60.0
 

@@ -16,7 +16,8 @@ from helpers.processes import new_threads, until
 from helpers.tokens import current_tokens
 
 from zstate.errors import Closed, SecondWriter
-from zstate.net.ownership import TOKEN_EXPIRY_S, WriterClaim, check_edges
+from zstate.net.edge_ownership import check_edges
+from zstate.net.ownership import TOKEN_EXPIRY_S, WriterClaim
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher

@@ -8,16 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
-from zstate.net.presence import (
-    LivelinessToken,
-    RobotInfo,
-    WriterWatch,
-    announce,
-    announce_reader,
-    discover,
-    discover_readers,
-    local_writer,
-)
+from zstate.net.discovery import RobotInfo, discover, discover_readers
+from zstate.net.presence import LivelinessToken, WriterWatch, announce, announce_reader, local_writer
 from zstate.net.session import Session, connect
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId

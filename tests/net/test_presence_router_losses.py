@@ -9,7 +9,8 @@ import pytest
 from helpers.processes import until
 
 from zstate.errors import Unreachable
-from zstate.net.presence import RouterLossDetector, WriterWatch, announce, discover
+from zstate.net.discovery import discover
+from zstate.net.presence import RouterLossDetector, WriterWatch, announce
 from zstate.net.session import connect
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import WRITER_TOKEN
@@ -59,7 +60,7 @@ def test_peers_lose_no_router(sessions):
 
 def test_discovery_without_the_whole_reply_is_an_error(spawn, free_port, monkeypatch: pytest.MonkeyPatch):
     """The router answers no more: that is not a network without robots."""
-    monkeypatch.setattr("zstate.net.presence._ALL_TOKENS_WITHIN_S", 0.2)
+    monkeypatch.setattr("zstate.net.discovery.ALL_TOKENS_WITHIN_S", 0.2)
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = spawn(ROUTER, endpoint)
     router.line()

@@ -14,7 +14,8 @@ import zenoh
 from helpers.processes import DEADLINE_S, until
 
 from zstate.net import query_workers
-from zstate.net.queryable import Queryable, Reply, RequestQueryable, parse_parameters, query
+from zstate.net.queryable import Queryable, Reply, parse_parameters, query
+from zstate.net.request_queryable import RequestQueryable
 from zstate.net.session import Session, connect
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 

@@ -16,13 +16,8 @@ from helpers.tokens import current_tokens
 
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net import queryable
-from zstate.net.presence import (
-    RobotInfo,
-    WriterWatch,
-    discover,
-    discover_readers,
-    local_writer,
-)
+from zstate.net.discovery import RobotInfo, discover, discover_readers
+from zstate.net.presence import WriterWatch, local_writer
 from zstate.net.queryable import Tokens, query, query_tokens
 from zstate.net.session import Session, connect
 from zstate.net.writer import WireWriter, write_all

@@ -13,15 +13,9 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.queryable import Queryable, Reply
+from zstate.net.reference_ring import ReferenceRing
 from zstate.net.requests import Requests
-from zstate.net.sample_history import (
-    CachedSample,
-    HistoryRequest,
-    ReferenceRing,
-    SampleCache,
-    SampleRing,
-    serve_history,
-)
+from zstate.net.sample_history import CachedSample, HistoryRequest, SampleCache, SampleRing, serve_history
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.wire.messages import HistoryPage, JointState

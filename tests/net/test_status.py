@@ -13,7 +13,7 @@ from helpers.robots import RRBOT, put, wait_for_reader
 from msgspec.structs import replace
 
 from zstate.errors import Closed, InvalidInput
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session, connect
 from zstate.net.status import StatusPublisher
 from zstate.net.status_monitor import StatusSubscriber

@@ -6,7 +6,8 @@ from helpers.processes import DEADLINE_S, repeated, until
 
 from zstate.errors import Closed
 from zstate.net.session import connect
-from zstate.net.streams import KeyPublisher, StreamInbox, StreamSubscriber, capacity_for
+from zstate.net.stream_inbox import StreamInbox
+from zstate.net.streams import KeyPublisher, StreamSubscriber, capacity_for
 from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r/joint_states"

@@ -10,7 +10,8 @@ from helpers.processes import until
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import KeyPublisher
 from zstate.net.subscription import Received, subscribe
-from zstate.wire.messages import JointState, StaticTransforms, order_digest, renumbered, to_block
+from zstate.wire.measurements import renumbered
+from zstate.wire.messages import JointState, StaticTransforms, order_digest, to_block
 from zstate.wire.native import NativeWire, encode, encoding_of
 
 STATE = JointState(5, 0, 1, order_digest(("a",)), to_block([0.5]))

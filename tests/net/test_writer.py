@@ -6,7 +6,8 @@ from helpers.raw_ros_nodes import DESCRIPTION, JOINT_STATES, KeySubscriber, key_
 from helpers.robots import STAMP, wait_for_reader
 
 from zstate.errors import Closed, InvalidInput
-from zstate.net.presence import discover, local_writer
+from zstate.net.discovery import discover
+from zstate.net.presence import local_writer
 from zstate.net.session import connect
 from zstate.net.writer import WireWriter, write_all
 from zstate.wire.joint_order import SampleLayout

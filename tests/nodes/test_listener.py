@@ -16,7 +16,8 @@ from zstate.clock import ManualClock
 from zstate.errors import AmbiguousFrame, InvalidInput, UnknownFrame
 from zstate.model.load import load_model
 from zstate.net.clock_offset import measure_offsets
-from zstate.net.presence import announce, discover
+from zstate.net.discovery import discover
+from zstate.net.presence import announce
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

@@ -11,7 +11,7 @@ from helpers.urdf_text import joint
 
 from zstate.errors import Closed, InFuture, InvalidInput, NoData, SecondWriter
 from zstate.model.load import load_model
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import StatePublisher
@@ -154,6 +154,7 @@ def test_later_of_two_drivers_that_missed_each_other_ends_once_the_first_publish
     with PartialStatePublisher(sessions[0], RRBOT, [ELBOW], "r1", program="gripper.py") as first:
         with monkeypatch.context() as at_once:  # the tokens of the first are on the way
             at_once.setattr("zstate.net.ownership.confirmed_tokens", missed)
+            at_once.setattr("zstate.net.edge_ownership.confirmed_tokens", missed)
             second = PartialStatePublisher(sessions[1], RRBOT, joints, "r1", program="both.py")
         with second:
             with pytest.raises(SecondWriter, match=SECOND_DRIVER):

@@ -15,9 +15,9 @@ from zstate.errors import Closed, InvalidInput
 from zstate.model.kinematics import Kinematics, MovingEdges
 from zstate.model.load import load_model
 from zstate.model.pinocchio_solver import select_engine
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import connect
-from zstate.nodes import publisher as publisher_module
+from zstate.nodes import moving_edges
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.publisher_status import StreamStats
@@ -318,7 +318,7 @@ def test_without_pinocchio_closed_forms_serve_and_one_warning_names_what_mends_i
     sessions, monkeypatch, caplog
 ):
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    publisher_module._warn_of_closed_forms.cache_clear()
+    moving_edges._warn_of_closed_forms.cache_clear()
     writer, reader = sessions
     transforms = SampleCollector(reader, TF)
     with caplog.at_level(logging.WARNING, "zstate"):
@@ -334,7 +334,7 @@ def test_without_pinocchio_closed_forms_serve_and_one_warning_names_what_mends_i
     sample = decode(transforms.payloads(1)[0], encoding_of(TransformSample), TransformSample)
     expected = Kinematics(RRBOT).edge_poses([0.25, -0.5])[moves]
     assert poses_from_block(sample.poses).tolist() == expected.tolist()
-    publisher_module._warn_of_closed_forms.cache_clear()
+    moving_edges._warn_of_closed_forms.cache_clear()
 
 
 WITHOUT_TRANSFORMS = """

@@ -19,8 +19,8 @@ from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
-from zstate.plugins import is_named
 from zstate.sources import SineSource
+from zstate.stream_registry import is_named
 from zstate.transform import Transform
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import WRITER_TOKEN, stream_key

@@ -6,7 +6,7 @@ from helpers.robots import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Closed, InsertRefused, InvalidInput
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

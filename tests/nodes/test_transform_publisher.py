@@ -14,7 +14,8 @@ from helpers.tokens import current_tokens
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
-from zstate.net.presence import announce, discover
+from zstate.net.discovery import discover
+from zstate.net.presence import announce
 from zstate.net.session import connect
 from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import KeyPublisher

@@ -14,7 +14,7 @@ from helpers.tokens import current_tokens
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput, LookupFailed, SecondWriter
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
@@ -31,7 +31,8 @@ from zstate.odometry import (
 from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
 from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.messages import Message, covariance_matrix, covariances_of, from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import Message, covariances_of, from_block
 from zstate.wire.registry import get_wire
 
 MS = 1_000_000

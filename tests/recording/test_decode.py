@@ -28,6 +28,7 @@ from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.measurements import to_float32_block
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
@@ -36,7 +37,6 @@ from zstate.wire.messages import (
     from_block,
     poses_from_block,
     to_block,
-    to_float32_block,
 )
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options

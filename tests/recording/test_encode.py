@@ -30,6 +30,7 @@ from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import Record
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.measurements import to_float32_block
 from zstate.wire.messages import (
     ClockMessage,
     JointState,
@@ -38,7 +39,6 @@ from zstate.wire.messages import (
     TransformSample,
     order_digest,
     to_block,
-    to_float32_block,
 )
 
 NOW = 1_790_000_000 * S

@@ -20,8 +20,9 @@ from helpers.recording_builder import (
     swing_velocities,
 )
 
-from zstate.errors import InvalidInput, LibraryMissing, RecordingError, UnknownFrame
+from zstate.errors import InvalidInput, LibraryMissing, UnknownFrame
 from zstate.model.urdf import parse_urdf
+from zstate.recording.errors import RecordingError
 from zstate.recording.export import Exporter, ExportReport, StreamedBuffer
 from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, order_digest, to_block

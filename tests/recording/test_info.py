@@ -8,10 +8,11 @@ import pytest
 from helpers.recording_builder import MS, RecordingBuilder
 from helpers.recording_files import START, S, joint_states, write_run
 
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.info import read_info, recorded_robots
 from zstate.scans.messages import LaserScan, OccupancyGrid
-from zstate.wire.messages import to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import to_block
 
 
 def test_info_has_the_facts_of_the_writer(tmp_path: Path):

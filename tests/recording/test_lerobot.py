@@ -19,7 +19,8 @@ parquet = pytest.importorskip("pyarrow.parquet", reason="pip install 'zstate[exp
 from helpers.pictures import jpeg, video  # noqa: E402 - which needs PyAV
 
 from zstate.cameras.messages import CompressedImage  # noqa: E402
-from zstate.errors import InvalidInput, RecordingError  # noqa: E402
+from zstate.errors import InvalidInput  # noqa: E402
+from zstate.recording.errors import RecordingError  # noqa: E402
 from zstate.recording.lerobot import DatasetReport, export_lerobot  # noqa: E402
 
 FPS = 25

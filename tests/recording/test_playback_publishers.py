@@ -44,14 +44,8 @@ from zstate.scans import ScanPublisher
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.keys import WRITER_TOKEN
-from zstate.wire.messages import (
-    JointState,
-    TransformSample,
-    order_digest,
-    poses_from_block,
-    to_block,
-    to_float32_block,
-)
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import JointState, TransformSample, order_digest, poses_from_block, to_block
 from zstate.wire.native import decode, encoding_of
 from zstate.wire.registry import get_wire
 from zstate.wire.ros2.options import Ros2Options

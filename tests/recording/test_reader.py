@@ -30,7 +30,7 @@ from rosbags.rosbag2 import Reader as RosbagReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.info import read_info
 from zstate.recording.mcap.records import MAX_CHUNK_BYTES
 from zstate.recording.mcap.recover import recover

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.recording_files import joint_states, write_run
 
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.reader import RecordingReader, bag_files
 
 # As `ros2 bag record` of Foxy, Humble and Jazzy writes it: yaml-cpp, lists one step in.

@@ -22,7 +22,7 @@ from rosbags.highlevel import AnyReader
 from zstate.driving import Commander, DriverHost, Limits, SimulatedDriver, stop
 from zstate.driving.driver import StopMode
 from zstate.driving.messages import JointCommand, Stop
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
 from zstate.model.kinematics import MovingEdges
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
@@ -44,6 +44,7 @@ from zstate.odometry import (
     PressurePublisher,
     VelocityPublisher,
 )
+from zstate.recording.errors import RecordingError
 from zstate.recording.info import read_info, recorded_robots
 from zstate.recording.player import Player
 from zstate.recording.reader import RecordingReader
@@ -53,14 +54,8 @@ from zstate.scans import Grid, MapPublisher, ScanPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
 from zstate.wire.keys import WRITER_TOKEN
-from zstate.wire.messages import (
-    ClockMessage,
-    JointState,
-    covariance_matrix,
-    from_block,
-    order_digest,
-    to_block,
-)
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import ClockMessage, JointState, from_block, order_digest, to_block
 from zstate.wire.native import encode, encoding_of
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys

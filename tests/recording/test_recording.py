@@ -23,12 +23,14 @@ from helpers.recording_files import STORE
 from rosbags.rosbag2 import StoragePlugin
 
 from zstate import Recording, UnknownFrame
-from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
+from zstate.errors import Disconnected, InPast, InvalidInput
 from zstate.odometry.messages import Fix, Imu, Pose
+from zstate.recording.errors import RecordingError
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import to_block
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import FrameNames

@@ -22,11 +22,12 @@ from helpers.recording_builder import (
 from rosbags.rosbag2 import StoragePlugin
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.errors import Disconnected, InvalidInput, RecordingError, UnknownFrame
+from zstate.errors import Disconnected, InvalidInput, UnknownFrame
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.model.kinematics import Kinematics
+from zstate.recording.errors import RecordingError
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import RobotDescription

@@ -111,7 +111,7 @@ def retention(tmp_path: Path) -> Callable[[str], Retention]:
 
 def test_files_older_than_the_age_are_deleted(week: list[Path], retention: Callable[[str], Retention]):
     kept = retention("84h")  # three and a half days
-    deleted = list(kept.delete_excess(week[-1]))
+    deleted = list(kept.delete_excess({week[-1]}))
     assert [file.path for file in deleted] == week[:4]
     assert [path for path in week if path.exists()] == week[4:]
     assert (kept.deleted_files, kept.deleted_bytes) == (4, sum(file.size for file in deleted))
@@ -122,9 +122,9 @@ def test_oldest_files_are_deleted_until_the_rest_is_within_the_size(
 ):
     sizes = [path.stat().st_size for path in week]
     kept = retention(f"{sum(sizes[3:]) / 1000.0:.3f}kB")
-    assert [file.path for file in kept.delete_excess(week[-1])] == week[:3]
+    assert [file.path for file in kept.delete_excess({week[-1]})] == week[:3]
     assert kept.kept_bytes == sum(sizes[3:])
-    assert not list(kept.delete_excess(week[-1]))
+    assert not list(kept.delete_excess({week[-1]}))
 
 
 def test_files_being_written_stay(week: list[Path], retention: Callable[[str], Retention], tmp_path: Path):
@@ -132,22 +132,22 @@ def test_files_being_written_stay(week: list[Path], retention: Callable[[str], R
     with RecordingWriter(other):
         os.utime(other, (0, 0))
         remaining = {week[0], other}
-        deleted = [file.path for file in retention("1s").delete_excess(week[0])]
+        deleted = [file.path for file in retention("1s").delete_excess({week[0]})]
         assert deleted == week[1:]
         assert set(tmp_path.iterdir()) == remaining
     os.utime(other, (0, 0))
-    assert [file.path for file in retention("1s").delete_excess(week[0])] == [other]
+    assert [file.path for file in retention("1s").delete_excess({week[0]})] == [other]
 
 
 def test_growth_ends_at_the_bound(week: list[Path], retention: Callable[[str], Retention]):
     total = sum(path.stat().st_size for path in week)
     kept = retention("1MB")
-    list(kept.delete_excess(week[-1]))
+    list(kept.delete_excess({week[-1]}))
     assert kept.kept_bytes == total
     assert kept.growth(1.0, 100.0) == 100.0
     assert kept.growth(1e3, DAY_S) == 1e6 - total
     by_age = retention("30d")
-    list(by_age.delete_excess(week[-1]))
+    list(by_age.delete_excess({week[-1]}))
     assert by_age.growth(1.0, DAY_S) == DAY_S
     # Old recordings are deleted as fast as new ones come.
     assert by_age.growth(total / (30 * DAY_S), DAY_S) == pytest.approx(0.0, abs=1e-6)
@@ -160,5 +160,5 @@ def test_growth_of_a_recording_that_does_not_split_has_no_bound(tmp_path: Path):
 
 def test_missing_folder_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     pattern = FilePattern(str(tmp_path / "gone" / "%Y.mcap"))
-    assert not list(Retention(pattern, Keep.parse("1d"), is_split=True).delete_excess(tmp_path / "a"))
+    assert not list(Retention(pattern, Keep.parse("1d"), is_split=True).delete_excess({tmp_path / "a"}))
     assert "cannot be listed" in caplog.text

@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid
+from zstate.stream_registry import stream_named
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import Message, to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import Message, to_block
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.options import Ros2Options

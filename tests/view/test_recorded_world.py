@@ -19,7 +19,8 @@ from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.view.data_source import ViewSource
 from zstate.view.recorded_world import LogTimes, RecordedSensor, RecordedValue
 from zstate.view.world_source import WriterName
-from zstate.wire.messages import to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import to_block
 
 FRONT, FLOOR = WriterName("cart", "front"), WriterName("hall", "floor")
 TOP, WRIST = WriterName("cart", "top"), WriterName("cart", "wrist")

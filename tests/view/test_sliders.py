@@ -19,7 +19,7 @@ from zstate.errors import InvalidInput
 from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.odometry import ImuNoise

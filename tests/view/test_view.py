@@ -25,7 +25,8 @@ from zstate.view.camera import Camera, Visibility, fit_camera
 from zstate.view.data_source import ViewSource
 from zstate.view.server import ViewServer
 from zstate.view.view import View
-from zstate.wire.messages import to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import to_block
 
 CART = load_model("diffbot")
 STILL = [0.0, 0.0, 0.0, 1.0]

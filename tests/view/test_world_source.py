@@ -14,7 +14,8 @@ from zstate.scans import Scan
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.transform import Transform
 from zstate.view.world_source import LiveSensor, WorldSource, WriterName
-from zstate.wire.messages import to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import to_block
 
 MS = 1_000_000
 

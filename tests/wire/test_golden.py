@@ -22,7 +22,7 @@ from zstate.driving.messages import MotionOutcome
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
-from zstate.plugins import all_streams, is_named, latched_streams, own_streams
+from zstate.stream_registry import all_streams, is_named, latched_streams, own_streams
 from zstate.streams import StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId

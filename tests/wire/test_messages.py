@@ -18,22 +18,20 @@ from zstate.odometry.messages import (
     Velocity,
     with_full_names,
 )
-from zstate.plugins import stream_named
 from zstate.scans.messages import LaserScan, OccupancyGrid, cells_of
+from zstate.stream_registry import stream_named
+from zstate.wire.measurements import covariance_matrix, from_float32_block, to_float32_block
 from zstate.wire.messages import (
     JointState,
     Message,
     StaticTransforms,
     TransformSample,
     WriterTransforms,
-    covariance_matrix,
     edge_of,
     from_block,
-    from_float32_block,
     order_digest,
     poses_from_block,
     to_block,
-    to_float32_block,
 )
 from zstate.wire.native import decode, encode, encoding_of
 

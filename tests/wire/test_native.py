@@ -32,10 +32,11 @@ from zstate.odometry.messages import (
     Pressure,
     Velocity,
 )
-from zstate.plugins import all_streams
 from zstate.scans.messages import LaserScan, OccupancyGrid
+from zstate.stream_registry import all_streams
 from zstate.streams import LATCHED_BYTES, StreamName
 from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.measurements import to_float32_block
 from zstate.wire.messages import (
     ClockMessage,
     HistoryPage,
@@ -48,7 +49,6 @@ from zstate.wire.messages import (
     WriterTransforms,
     order_digest,
     to_block,
-    to_float32_block,
 )
 from zstate.wire.native import (
     NativeWire,

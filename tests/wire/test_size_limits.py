@@ -18,7 +18,7 @@ from zstate.net.session import connect
 from zstate.net.streams import KeyPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.plugins import stream_named
+from zstate.stream_registry import stream_named
 from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import NativeWire, decode, encode, encoding_of
 from zstate.wire.protocol import SerializedSample

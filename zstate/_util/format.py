@@ -1,22 +1,15 @@
-"""Texts in messages: durations and stamps, why two stamps are far apart, suggestions for misspelled names.
-
-And the tables that notebooks show of values (``_repr_html_``).
-"""
+"""Texts in messages: durations and stamps, why two stamps are far apart, suggestions for misspelled names."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from difflib import get_close_matches
-from typing import Any, cast
 
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
 _UNITS = (("seconds", SECOND_NS), ("milliseconds", 1_000_000), ("microseconds", 1_000))
 
-# Notebooks align cells to the right and collapse line breaks; a page of documentation leaves no room.
-_CELL = 'style="text-align:left;white-space:pre-wrap;padding:0.1em 0.6em 0.1em 0"'
 
 # A clock that was set shows 1980 or later; no simulation lasts ten years.
 _FIRST_DECADE_NS = 3650 * DAY_NS
@@ -85,43 +78,3 @@ def suggestion_text(*names: str | None) -> str:
     """``; did you mean 'x' or 'y'?``; empty without names. None stands for no name."""
     found = [repr(name) for name in names if name is not None]
     return f"; did you mean {' or '.join(found)}?" if found else ""
-
-
-def html_of_fields(value: Any) -> str:
-    """The fields of a dataclass that have a value, as HTML."""
-    named = {field.name: getattr(value, field.name) for field in fields(value)}
-    rows = [(name, _value_text(one)) for name, one in named.items() if one not in (None, "")]
-    return html_table(type(value).__name__, rows)
-
-
-def html_table(title: str, rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> str:
-    """Rows of plain texts as HTML, the first of each row being its name.
-
-    Texts are escaped, because names come from the network. There are no colours, so that the table has
-    those of the notebook's theme.
-    """
-    from html import escape  # noqa: PLC0415 - of 1 ms, which only notebooks need
-
-    def line(cells: Sequence[str], heads: int) -> str:
-        tags = ["th"] * heads + ["td"] * (len(cells) - heads)
-        texts = map(escape, cells)
-        return "".join(f"<{tag} {_CELL}>{text}</{tag}>" for tag, text in zip(tags, texts, strict=True))
-
-    lines = [line(headings, len(headings))] * bool(headings) + [line(row, 1) for row in rows]
-    body = "".join(f"<tr>{cells}</tr>" for cells in lines)
-    table = f"<table><caption {_CELL}>{escape(title)}</caption>{body}</table>"
-    return f'<div style="overflow-x:auto;font-size:0.9em">{table}</div>'
-
-
-def _value_text(value: object) -> str:
-    """A number with six digits, a line for each item of a mapping or tuple, and other values as printed."""
-    if isinstance(value, Mapping):
-        items = cast("Mapping[Any, Any]", value).items()
-        return "\n".join(f"{_key_text(key)}: {one}" for key, one in items) or "none"
-    if type(value) is tuple:
-        return "\n".join(map(str, cast("tuple[object, ...]", value)))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _key_text(key: Any) -> str:
-    return " ".join(map(str, key)) if isinstance(key, tuple) else str(key)  # pyright: ignore[reportUnknownArgumentType]

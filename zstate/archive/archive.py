@@ -36,7 +36,7 @@ from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput, LookupFailed, MessageError
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
-from zstate.plugins import stream_named
+from zstate.stream_registry import stream_named
 from zstate.wire.messages import Message
 from zstate.wire.native import decode
 

@@ -13,10 +13,11 @@ import numpy as np
 from zstate.archive.archive import Archive
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.tracks import PoseTrack
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.recording.encode import RecordingEncoder
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.streams import StreamName
 from zstate.wire.messages import (

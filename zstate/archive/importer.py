@@ -1,9 +1,9 @@
 """Import of a recording into an archive: the samples that lookups in the recording read, and all messages.
 
 A robot has what ``Recording(path, robot).buffer()`` holds, by the rules there: a history that another one
-replaces is not imported. Joint states are decoded in batches, with their efforts; moving edges, and the
-joints of several drivers, are taken from a buffer in parts while it is filled. Memory does not grow with the
-recording.
+replaces is not imported. The recording is read once for all robots. Joint states are decoded in batches, with
+their efforts; moving edges, and the joints of several drivers, are taken from a buffer in parts while it is
+filled. Memory does not grow with the recording.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
@@ -46,17 +46,28 @@ from zstate.archive.layout import (
 )
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.joint_samples import track_samples
 from zstate.buffer.tracks import JointTrack, PoseTrack
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.ingest.counters import Counters
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
-from zstate.plugins import stream_named
-from zstate.recording.decode import DecodedMessage, DecodedRecording
+from zstate.recording.decode import (
+    DecodedMessage,
+    DecodedRecording,
+    JoinedMessages,
+    RecordedWriter,
+    UndecodedRecord,
+)
+from zstate.recording.errors import RecordingError
 from zstate.recording.export import joint_columns
-from zstate.recording.joint_states import DELAYED_NS, RecordedJointReader
+from zstate.recording.joint_parts import has_parts
+from zstate.recording.joint_states import DELAYED_NS, JointStateBatch, RecordedJointReader
+from zstate.recording.mcap.file import split_files
 from zstate.recording.reader import RecordingReader
-from zstate.recording.recording import HISTORY_S, Recording
+from zstate.recording.recording import HISTORY_S, RecordingLoader
 from zstate.recording.stream_export import plain_columns
+from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import encode, encoding_of
@@ -66,6 +77,17 @@ NewPath = Callable[[], Path]
 _MESSAGES = 4096
 """Messages after which samples are moved from the buffer to files, and messages of a stream written."""
 
+_PROGRESS = 50_000
+"""Messages after which progress is reported."""
+
+_WAITING_BYTES = 64_000_000
+"""Bytes of records of all robots after which all are decoded."""
+
+_ROBOTS = 32
+"""Robots for which a recording is read once: each has row groups in memory."""
+
+_MOVING = ("tf", "transforms")
+_READ_BY_JOINTS = {*JOINT_STREAMS, "robot_description"}
 _IN_FILES_OF_THEIR_OWN = {*JOINT_STREAMS, "tf", "transforms", "tf_static", "robot_description", "clock"}
 _DATED_NS = 10**17
 """Stamps before 1973 are those of a simulation: they have no date."""
@@ -94,48 +116,62 @@ def import_recording(
     """Add the recording ``path`` to the archive ``url``, which is made if it is missing.
 
     A recording that was added before adds nothing. An import that is interrupted leaves the archive as it
-    was; another one of the same recording completes it. ``on_progress(text)`` is called now and then.
-    Raises RecordingError for a recording that cannot be read or is not complete, and an archive that cannot
-    be written, and InvalidInput for a recording in simulated time, whose stamps have no date.
+    was; another one of the same recording completes it. Each file of a split recording is added by itself.
+    ``on_progress(text)`` is called now and then. Raises RecordingError for a recording that cannot be read
+    or is not complete, and an archive that cannot be written, and InvalidInput for a recording in simulated
+    time, whose stamps have no date.
     """
-    store = Store(url)
-    with RecordingReader(path) as reader:
-        files = [storage.path for storage in reader.storages]
+    store, path = Store(url), Path(path)
+    parts = [path] if path.is_dir() else split_files(path)[0]
+    reports = [_import_part(store, part, on_progress) for part in parts]
+    whole = ImportReport(path, all(one.is_known for one in reports))
+    for one in reports:
+        whole.robots = sorted({*whole.robots, *one.robots})
+        whole.rows += one.rows
+        whole.files += one.files
+        whole.size += one.size
+        whole.refused += one.refused
+    return whole
+
+
+def _import_part(store: Store, path: Path, on_progress: Callable[[str], object]) -> ImportReport:
+    with RecordingReader(path, is_alone=True) as reader:
         if not reader.complete:
             text = f"{str(path)!r} is not complete: {'; '.join(reader.losses) or 'it has no end'}"
             advice = (
                 "wait until it is recorded, or let `zstate recover` write a complete file of what is there"
             )
             raise RecordingError(f"{text}; {advice}", path=str(path))
-        decoded = DecodedRecording(reader, Refusals().count)
-        span = reader.span
-    name = file_digest(files)
-    report = ImportReport(Path(path), robots=decoded.names)
-    record = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
-    if store.has(record):
-        report.is_known = True
-        return report
-    with store.staging(name) as folder:
-        rows: list[dict[str, Any]] = []
-        pending: dict[str, Path] = {}
-        new_path = map(folder.joinpath, map(str, count()))
-        for robot in decoded.names:
-            one = _RobotImport(path, robot, decoded, new_path.__next__, report.refused)
-            for text in one.run():
-                on_progress(text)
-            rows += listed(one.files, one.scene, pending, name)
-            pending |= one.small_files(store, name)
-        for row in rows:
-            row |= {"recording": str(Path(path).name), "recorded": span[0] if span else 0}
-            row["imported"] = time.time_ns()
-            report.rows[row["stream"]] += row["rows"]
-            report.size += row["bytes"]
-        report.files = len(rows)
-        for target, staged in pending.items():
-            store.put(staged, target)
-        staged = new_path.__next__()
-        write_small(staged, record_schema(), rows)
-        store.put(staged, record)  # the import counts from now on
+        name = file_digest(storage.path for storage in reader.storages)
+        record = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
+        if store.has(record):
+            return ImportReport(path, is_known=True)
+        refusals = Refusals(f"recorded messages of {path.name!r}")
+        decoded = DecodedRecording(reader, refusals.count)
+        report = ImportReport(path, robots=decoded.names)
+        with store.staging(name) as folder:
+            rows: list[dict[str, Any]] = []
+            pending: dict[str, Path] = {}
+            new_path = map(folder.joinpath, map(str, count()))
+            for first in range(0, len(decoded.names), _ROBOTS):
+                reading = _Reading(reader, decoded, decoded.names[first : first + _ROBOTS], new_path.__next__)
+                for text in reading.run(refusals):
+                    on_progress(text)
+                for one in reading.robots:
+                    rows += listed(one.files, one.scene, pending, name)
+                    pending |= one.small_files(store, name)
+            for row in rows:
+                row |= {"recording": path.name, "recorded": reader.span[0] if reader.span else 0}
+                row["imported"] = time.time_ns()
+                report.rows[row["stream"]] += row["rows"]
+                report.size += row["bytes"]
+            report.files = len(rows)
+            report.refused.update(refusals.counts)
+            for target, staged in pending.items():
+                store.put(staged, target)
+            staged = new_path.__next__()
+            write_small(staged, record_schema(), rows)
+            store.put(staged, record)  # the import counts from now on
     return report
 
 
@@ -218,23 +254,67 @@ class _Taken(NamedTuple):
     last: int
 
 
-class _RobotImport:
-    """Writes files of one ``robot`` of the recording ``path``, each to the next of the paths ``new_path()``.
+class _Reading:
+    """Reads a recording once for the imports of ``names``."""
 
-    ``files`` and ``scene``, the digest of its frames, are known after ``run``.
+    def __init__(
+        self,
+        reader: RecordingReader,
+        decoded: DecodedRecording,
+        names: Sequence[str],
+        new_path: NewPath,
+    ) -> None:
+        self._reader, self._decoded, self._new_path = reader, decoded, new_path
+        self._names = names
+        self.robots: list[_RobotImport] = []
+
+    def run(self, refusals: Refusals) -> Iterator[str]:
+        """Write all files; texts of the progress are returned in between."""
+        decoded = self._decoded
+        # What is decoded before the imports begin is decoded again by them.
+        beginning = DecodedRecording(self._reader, lambda reason, text: None)
+        self.robots = [
+            _RobotImport(name, decoded, beginning, self._new_path, refusals) for name in self._names
+        ]
+        receivers: dict[RecordedWriter, list[_RobotImport]] = {}
+        for one in self.robots:
+            for writer in one.writers_read:
+                receivers.setdefault(writer, []).append(one)
+        streams = {writer.stream for writer in receivers}
+        total, waiting = sum(decoded.writers[writer] for writer in receivers), 0
+        selected = set(self._names) if len(self._names) < len(decoded.names) else None
+        for number, undecoded in enumerate(decoded.records(selected, streams), 1):
+            for one in receivers.get(undecoded.channel.writer, ()):
+                one.add(undecoded)
+            waiting += len(undecoded.record.payload)
+            if waiting >= _WAITING_BYTES:
+                waiting = 0
+                for one in self.robots:
+                    one.flush()
+            if not number % _PROGRESS:
+                yield f"{number} of {total} messages"
+        for one in self.robots:
+            one.finish()
+
+
+class _RobotImport:
+    """Writes files of one ``robot`` of the recording ``decoded``, each to the next path, ``new_path()``.
+
+    ``beginning`` is the same recording, for what is read ahead. ``files`` and ``scene``, the digest of its
+    frames, are known after ``finish``.
     """
 
     def __init__(
         self,
-        path: str | Path,
         robot: str,
         decoded: DecodedRecording,
+        beginning: DecodedRecording,
         new_path: NewPath,
-        refused: Counter[str],
+        refusals: Refusals,
     ) -> None:
-        self._path, self._robot, self._new_path, self._refused = path, robot, new_path, refused
+        self._robot, self._new_path = robot, new_path
         self._writers = {one: number for one, number in decoded.writers.items() if one.robot == robot}
-        self._streams = {one.stream for one in decoded.writers_of((robot,))} - {"clock"}
+        self.writers_read = {one for one in decoded.writers_of((robot,)) if one.stream != "clock"}
         self._tables: dict[tuple[str, str], SampleTable] = {}
         self._taken: dict[tuple[str, str], _Taken] = {}
         self._frames: list[dict[str, Any]] = []
@@ -243,19 +323,52 @@ class _RobotImport:
         self._number = 0
         self.files: list[WrittenFile] = []
         self.scene = ""
+        self._joints: RecordedJointReader | None = None
+        self._kinds: set[str] = set()
+        if any(one.robot == robot and one.stream in JOINT_STREAMS for one in decoded.writers):
+            joints = RecordedJointReader(decoded, robot, refusals.count)
+            if joints.model is None or not has_parts(beginning, robot, joints.model):
+                self._joints = joints
+        self._buffer = TransformBuffer(HISTORY_S)
+        self._loader = RecordingLoader.of(beginning, self._buffer, Counters(), (robot,))
+        self._joined = JoinedMessages(decoded)
+        self._decoded = decoded
+        self._waiting: list[UndecodedRecord] = []
+        self._description = b""
 
-    def run(self) -> Iterator[str]:
-        """Write all files; texts of the progress are returned in between."""
-        refusals = Refusals(f"recorded messages of {self._robot!r}")
-        with Recording(self._path, self._robot) as recording:
-            streams = self._streams
-            if streams & JOINT_STREAMS:
-                joints = recording.joint_state_reader(self._robot, refusals.count)
-                if isinstance(joints, RecordedJointReader):
-                    streams = streams - JOINT_STREAMS
-                    yield from self._add_batches(joints)
-            yield from self._add_rest(recording, streams)
-        self._refused.update(refusals.counts)
+    def add(self, undecoded: UndecodedRecord) -> None:
+        """The next record of ``writers_read``."""
+        stream = undecoded.channel.writer.stream
+        if self._joints is not None and stream in _READ_BY_JOINTS:
+            self._write_batches(self._joints.add(undecoded))
+            if stream in JOINT_STREAMS:
+                return
+        waiting = self._waiting
+        if stream == "robot_description":
+            if undecoded.record.payload == self._description:
+                return  # it is written again every 10 s
+            self._description = undecoded.record.payload
+            self._insert_waiting()  # by the model that they belong to
+            waiting = self._waiting
+        waiting.append(undecoded)
+        if len(waiting) >= _MESSAGES or stream == "robot_description":
+            self._insert_waiting()
+
+    def flush(self) -> None:
+        """Decode what was added."""
+        if self._joints is not None:
+            self._write_batches(self._joints.flush())
+        self._insert_waiting()
+
+    def finish(self) -> None:
+        """Write what is left, and end all files."""
+        self.flush()
+        if self._joints is not None:
+            self._write_batches(self._joints.finish())
+        self._take(self._buffer, is_end=True)
+        for key in list(self._messages):
+            self._write_messages(key)
+        self._describe(self._buffer)
         for table in self._tables.values():
             self.files += table.finish()
         rows = sorted(json.dumps(row, sort_keys=True) for row in self._frames)
@@ -266,33 +379,43 @@ class _RobotImport:
             self._tables[stream, key] = SampleTable(self._new_path, stream, self._robot, key)
         return self._tables[stream, key]
 
-    def _add_batches(self, reader: RecordedJointReader) -> Iterator[str]:
-        table, read = self._table(JOINTS), 0
-        kinds: set[str] = set()
-        for trajectory, restarts in reader.batches():
+    def _write_batches(self, batches: Iterable[JointStateBatch]) -> None:
+        for trajectory, restarts in batches:
+            table = self._table(JOINTS)
             if restarts:
                 table.restart()
-                kinds = set()
-            kinds |= trajectory.kinds
-            columns = joint_columns(trajectory.with_kinds(kinds))
+                self._kinds = set()
+            self._kinds |= trajectory.kinds
+            columns = joint_columns(trajectory.with_kinds(self._kinds))
             table.write(columns.pop("stamp"), columns)
-            read += len(trajectory)
-            yield f"{self._robot}: {read} of {reader.count} joint states"
 
-    def _add_rest(self, recording: Recording, streams: set[StreamName]) -> Iterator[str]:
-        buffer = TransformBuffer(HISTORY_S)
-        for number, decoded in enumerate(recording.fill(buffer, streams), 1):
-            if isinstance(decoded.message, RobotDescription):
-                self._check_clock(decoded.message)
-            elif decoded.writer.stream not in _IN_FILES_OF_THEIR_OWN:
-                self._add_message(decoded)
-            if not number % _MESSAGES:
-                self._take(buffer, is_end=False)
-                yield f"{self._robot}: {number} other messages"
-        self._take(buffer, is_end=True)
-        for key in list(self._messages):
-            self._write_messages(key)
-        self._describe(buffer)
+    def _insert_waiting(self) -> None:
+        """Insert the records that wait, without the transforms that the model defines."""
+        waiting, self._waiting = self._waiting, []
+        for undecoded in self._without_model_edges(waiting):
+            for decoded in self._joined.add(undecoded):
+                self._loader.insert(decoded)
+                if isinstance(decoded.message, RobotDescription):
+                    self._check_clock(decoded.message)
+                elif decoded.writer.stream not in _IN_FILES_OF_THEIR_OWN:
+                    self._add_message(decoded)
+        self._take(self._buffer, is_end=False)
+
+    def _without_model_edges(self, waiting: Sequence[UndecodedRecord]) -> Iterable[UndecodedRecord]:
+        """``waiting`` without transforms of the model's edges: those of one layout are looked at together."""
+        alike: dict[tuple[int, int], list[int]] = {}
+        for row, (channel, record, _) in enumerate(waiting):
+            if channel.writer.stream in _MOVING and not channel.covariances_of:
+                alike.setdefault((id(channel), len(record.payload)), []).append(row)
+        left_out: set[int] = set()
+        for rows in alike.values():
+            channel = waiting[rows[0]].channel
+            edges = channel.ros.edges([waiting[row].record.payload for row in rows])
+            if edges is not None:
+                names = channel.names.edges_to_zstate(edges)
+                if self._loader.leaves_out(channel.writer.robot, names):
+                    left_out.update(rows)
+        return (one for row, one in enumerate(waiting) if row not in left_out)
 
     def _check_clock(self, description: RobotDescription) -> None:
         if description.clock not in ("", "system"):
@@ -340,7 +463,7 @@ class _RobotImport:
             if isinstance(track, JointTrack):
                 key = "" if track is robot else " ".join(track.model.joint_names)
                 present[PARTS if key else JOINTS, key] = ""
-                self._write_joints(key, track.samples(view, None, None))
+                self._write_joints(key, track_samples(track, view))
             else:
                 present |= {(EDGES, child): parent for parent, child in track.edges}
                 self._write_edges(track, view.kept_stamps(), view.kept_rows())

@@ -42,7 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.archive.storage import arrow, file_digest
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 
 VERSION = 1
 """Of the layout. Columns may be added within a version."""

@@ -1,4 +1,4 @@
-"""What archives bring: a command. Their messages are those of recordings."""
+"""What archives bring: a command, and a store of recordings. Their messages are those of recordings."""
 
 from zstate.plugins import Command, Plugin
 
@@ -9,5 +9,6 @@ PLUGIN = Plugin(
             "zstate.archive.cli.archive:archive_command", "Record", "Recordings of months as Parquet."
         ),
     },
+    store="zstate.archive.store:ArchiveStore",
     needs=("recording",),
 )

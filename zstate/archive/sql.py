@@ -12,8 +12,9 @@ view                rows
 ==================  ====================================================================================
 
 ``zstate_pose(robot, target, source, stamp)`` is the pose of a frame, a struct of x y z [m], qx qy qz qw, as
-``Archive.lookup_many`` returns it; NULL where there is none. Select by ``robot`` and ``date``: only folders
-of these are read then. Views also show the files of an import that is under way, or was interrupted.
+``Archive.lookup_many`` returns it; NULL where there is none. Select by ``robot`` and ``date``: only files of
+these are read then. Views show the imports that were complete when the connection was made, and nothing of
+one that is under way, or was interrupted.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
@@ -21,13 +22,13 @@ of these are read then. Views also show the files of an import that is under way
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.archive.layout import FRAMES, IMPORTS, MODELS, POSE, WRITERS, folder_of, value_of
+from zstate.archive.layout import FRAMES, IMPORTS, MODELS, POSE, SUFFIX, WRITERS, folder_of, value_of
 from zstate.archive.storage import Store, arrow
 from zstate.errors import LibraryMissing
 
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 
 Lookup: TypeAlias = Callable[[NDArray[Any], str, str, NDArray[np.int64]], NDArray[np.float64]]
 """Poses of one frame in another, at the stamps [ns] of robots: (T, 7), NaN where there is none."""
-
-_TABLES = {"files": IMPORTS, "frames": FRAMES, "models": MODELS, "writers": WRITERS}
 
 
 def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
@@ -52,11 +51,15 @@ def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
             f"SQL needs duckdb, which cannot be loaded ({error}): pip install 'zstate[archive]'"
         ) from None
     connection = duckdb.connect()
-    for name, table in _TABLES.items():
-        _add_view(connection, store, name, folder_of(table), "*")
+    for name, table in (("files", IMPORTS), ("models", MODELS)):
+        _add_view(connection, store, name, [file.path for file in store.files(folder_of(table))])
+    complete = _Complete.read(connection, store)
+    for name, table in (("frames", FRAMES), ("writers", WRITERS)):
+        _add_view(connection, store, name, complete.of_table(store, table))
     for folder in store.folders(""):
         if folder.startswith("stream="):
-            _add_view(connection, store, value_of(folder), folder, "make_timestamp_ns(stamp) AS time, *")
+            paths = [file.path for file in store.files(folder) if file.path in complete.paths]
+            _add_view(connection, store, value_of(folder), paths, "make_timestamp_ns(stamp) AS time, *")
     poses = ", ".join(f"{name} DOUBLE" for name in POSE)
     create_function: Any = connection.create_function  # its annotations are others in each version
     parameters = ["VARCHAR", "VARCHAR", "VARCHAR", "BIGINT"]
@@ -83,19 +86,50 @@ class _PoseFunction:
         return pa.StructArray.from_arrays(columns, POSE, mask=pa.array(np.isnan(poses[:, 0])))
 
 
-def _add_view(connection: Any, store: Store, name: str, folder: str, columns: str) -> None:
-    """A view of all files in ``folder``; none without a file."""
-    if not store.files(folder):
+class _Complete(NamedTuple):
+    """What complete imports have: their ``names``, the ``paths`` of their samples, and of their frames."""
+
+    names: set[str]
+    paths: set[str]
+    frames: set[str]
+
+    @classmethod
+    def read(cls, connection: Any, store: Store) -> _Complete:
+        """What the view ``files`` lists."""
+        names = {name.removesuffix(SUFFIX) for name in store.names(folder_of(IMPORTS))}
+        if not names:
+            return cls(set(), set(), set())
+        rows = connection.execute("SELECT path, robot, frames FROM files").fetchall()
+        frames = {f"{folder_of(FRAMES, robot)}/{digest}{SUFFIX}" for _, robot, digest in rows}
+        return cls(names, {path for path, _, _ in rows}, frames)
+
+    def of_table(self, store: Store, table: str) -> list[str]:
+        """The files of ``table``, frames or writers."""
+        paths = [file.path for file in store.files(folder_of(table))]
+        if table == FRAMES:
+            return [path for path in paths if path in self.frames]
+        return [path for path in paths if path.rpartition("/")[2].removesuffix(SUFFIX) in self.names]
+
+
+def _add_view(connection: Any, store: Store, name: str, paths: Sequence[str], columns: str = "*") -> None:
+    """A view of the files ``paths``; none without a file."""
+    if not paths:
         return
     quoted = '"' + name.replace('"', '""') + '"'
+    full = [f"{store.root}/{path}" for path in paths]
     if store.is_local:  # DuckDB reads the files itself
-        pattern = f"{store.root}/{folder}/**/*.parquet".replace("'", "''")
-        is_alike = folder.partition("=")[0] != "stream"  # then one file shows the columns of all
+        is_alike = not paths[0].startswith("stream=")  # then one file shows the columns of all
         options = f"hive_partitioning = true, union_by_name = {str(not is_alike).lower()}"
-        source = f"read_parquet('{pattern}', {options})"
+        literals = ", ".join("'" + path.replace("'", "''") + "'" for path in full)
+        source = f"read_parquet([{literals}], {options})"
     else:
-        dataset = arrow().dataset.dataset(
-            f"{store.root}/{folder}", filesystem=store.filesystem, partitioning="hive", format="parquet"
+        fs = arrow().dataset
+        dataset = fs.dataset(
+            full,
+            filesystem=store.filesystem,
+            partitioning=fs.partitioning(flavor="hive"),
+            partition_base_dir=f"{store.root}/{paths[0].partition('/')[0]}",
+            format="parquet",
         )
         schemas = [dataset.schema, *(one.physical_schema for one in dataset.get_fragments())]
         source = f'"{name} files"'

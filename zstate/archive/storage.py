@@ -20,7 +20,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from zstate.errors import LibraryMissing, RecordingError
+from zstate.errors import LibraryMissing
+from zstate.recording.errors import RecordingError
 
 STAGING = ".import-"
 """The beginning of the name of a folder with the files of an import that is not complete."""

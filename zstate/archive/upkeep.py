@@ -24,7 +24,8 @@ from zstate.archive.layout import (
     write_small,
 )
 from zstate.archive.storage import STAGING, Store, arrow, bytes_digest
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.recording.errors import RecordingError
 
 
 class Finding(NamedTuple):

@@ -17,7 +17,8 @@ from zstate.odometry import OdometryPublisher
 from zstate.odometry.messages import Odometry
 from zstate.transform import Transform
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Edges, covariance_matrix, covariances_of, from_block, poses_from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import Edges, covariances_of, from_block, poses_from_block
 
 P = TypeVar("P", TransformPublisher, OdometryPublisher)
 

@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.other_names import with_tf2_methods
+from zstate._util.tf2_methods import with_tf2_methods
 from zstate.buffer.core import BufferCore
 from zstate.buffer.feed import BufferFeed
-from zstate.buffer.history import HistoryView
-from zstate.buffer.path import Plan, TransformPath, transforms_at_one_moment
-from zstate.buffer.projection import ProjectingCamera, project_rows
+from zstate.buffer.history_view import HistoryView
+from zstate.buffer.path import TransformPath, transforms_at_one_moment
 from zstate.buffer.robot_joints import RobotJoints
 from zstate.buffer.tracks import JointTrack, TimeSpan, Track
-from zstate.buffer.waiting import MessageFilter, RequiredStamps, TransformWatch, Waiter, WakeCondition
+from zstate.buffer.waiting import RequiredStamps, Waiter, WakeCondition
 from zstate.checks import Points, check_names, check_points
 from zstate.clock import Clock, check_stamp, check_stamps, check_stamps_of_points, wait_interruptible
 from zstate.errors import (
@@ -40,12 +39,16 @@ from zstate.errors import (
     UnknownFrame,
     as_timeout,
 )
-from zstate.model.joint_history import JointHistory
 from zstate.transform import Transform, Twist
 
 if TYPE_CHECKING:
     from zstate.buffer.interpolation_bound import InterpolationBound
+    from zstate.buffer.message_filter import MessageFilter
+    from zstate.buffer.plan import Plan
+    from zstate.buffer.projection import ProjectingCamera
     from zstate.buffer.snapshot import FramePoses, FrameTable, SnapshotReader
+    from zstate.buffer.watch import TransformWatch
+    from zstate.model.joint_history import JointHistory
 
 S = TypeVar("S")
 
@@ -130,15 +133,16 @@ class TransformBuffer(BufferCore):
         """
         if max_age_s is None and timeout_s == 0.0 and predict_s == 0.0:
             try:
-                cached = self._paths.get((target, source))
-            except TypeError:  # of a list, which has no hash and is no name
-                cached = None
-            if cached is not None and cached[0] == self._tree.version:
-                transform = cached[1].at(at)
-                if transform is not None:
-                    return transform
-                if not self._stop_reason:
-                    cached[1].raise_if_outside(at)
+                version, find, path, _ = self._paths[target, source]
+            except (KeyError, TypeError):  # TypeError of a list, which has no hash and is no name
+                pass
+            else:
+                if version == self._tree.version:
+                    transform = find(at)
+                    if transform is not None:
+                        return transform
+                    if not self._stop_reason:
+                        path.raise_if_outside(at)
         query = self._query(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
         if check_duration("timeout_s", timeout_s) > 0.0 and not self._stop_reason:
             return self._wait(query, timeout_s)
@@ -217,6 +221,8 @@ class TransformBuffer(BufferCore):
         Points that the camera does not see, without a transform at their instant, or that are not finite,
         are NaN and not valid. Raises as ``place`` does.
         """
+        from zstate.buffer.projection import project_rows  # noqa: PLC0415 - cameras load it
+
         path = self._path(camera.frame, frame)
         array = check_points(points).astype(np.float64, copy=False)  # as float32 it would be 1e-4 px
 
@@ -227,6 +233,8 @@ class TransformBuffer(BufferCore):
 
     def plan(self, target: str, source: str) -> Plan:
         """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""
+        from zstate.buffer.plan import Plan  # noqa: PLC0415 - of the loops that have one
+
         return Plan(target, source, self._tree, lambda: self._path(target, source))
 
     def twist(self, frame: str, reference: str, at: int | None = None) -> Twist:
@@ -350,7 +358,7 @@ class TransformBuffer(BufferCore):
 
     def _lookup(self, query: Query) -> Transform:
         try:
-            path = self._cached_path(query.target, query.source).path
+            path = self._cached_path(query.target, query.source)[2]
             transform = path.transform(query.at, query.predict_ns)
         except LookupFailed as reason:
             self._complete(reason, query.at)
@@ -398,7 +406,7 @@ class TransformBuffer(BufferCore):
         """The newest transform, with ``waiter`` expecting a newer one; else as ``_lookup_or_expect``."""
         version = self._tree.version
         try:
-            _, path, dependencies = self._cached_path(query.target, query.source)
+            *_, path, dependencies = self._cached_path(query.target, query.source)
             transform = path.at(None) or path.transform(None)
         except LookupFailed as reason:
             return self._expect_change(query, reason, waiter, version)
@@ -417,7 +425,7 @@ class TransformBuffer(BufferCore):
                 condition = WakeCondition(self._tree.dependencies(query.target, query.source))
         else:
             with suppress(LookupFailed):  # the tree has changed since, which its version shows
-                _, path, dependencies = self._cached_path(query.target, query.source)
+                *_, path, dependencies = self._cached_path(query.target, query.source)
                 condition = WakeCondition(dependencies, _required_stamps(query, reason, path), query.at)
         waiter.expect(condition, version)
         if _is_final(query, reason, condition):
@@ -439,6 +447,8 @@ class TransformBuffer(BufferCore):
         has moved or rotated so far since the last call. The frames need not exist yet. The callback runs on
         the thread that inserts: keep it short.
         """
+        from zstate.buffer.watch import TransformWatch  # noqa: PLC0415 - lookups do without
+
         if self._stop_reason:
             raise Closed(self._stop_reason)
         lookup_newest = partial(self._lookup_newest, self._query(target, source, None))
@@ -461,6 +471,8 @@ class TransformBuffer(BufferCore):
         ``timeout_s`` is left out and counted by its error in ``dropped``; one whose frame or stamp cannot be
         any raises InvalidInput.
         """
+        from zstate.buffer.message_filter import MessageFilter  # noqa: PLC0415 - lookups do without
+
         check_names(target)
         check_duration("timeout_s", timeout_s)
         return MessageFilter(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
@@ -494,8 +506,10 @@ class TransformBuffer(BufferCore):
         samples around it. The joints of the other drivers are interpolated as in lookups; their velocities
         are NaN. Raises InvalidInput as ``joint_positions``.
         """
+        from zstate.buffer.joint_samples import robot_samples  # noqa: PLC0415 - lookups read no samples
+
         start, end = (None if stamp is None else check_stamp(stamp) for stamp in (start, end))
-        return self._robot_joints(self._robot_track(robot)).samples(start, end)
+        return robot_samples(self._robot_joints(self._robot_track(robot)), start, end)
 
     def link_poses(self, robot: str, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of a robot at a stamp, and that stamp: (L, 7), rows as the ``links`` of its model.

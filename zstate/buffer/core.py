@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from numbers import Real
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,41 +14,28 @@ from numpy.typing import ArrayLike, NDArray
 from zstate._util.fork_safe import fork_safe
 from zstate._util.format import did_you_mean
 from zstate.buffer.clock_domain import ClockDomain
-from zstate.buffer.covariance_path import compile_path_with_covariances
 from zstate.buffer.feed import BufferFeed
-from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies
-from zstate.buffer.history import HistoryView, insert_together, keep_only_around
-from zstate.buffer.path import TransformPath
-from zstate.buffer.pose_tracks import (
-    EdgeNames,
-    Poses,
-    PoseTrackTable,
-    TooOld,
-    check_covariances,
-    check_poses,
-    second_writer,
-)
-from zstate.buffer.tracks import JointTrack, Track, TrackOwner
+from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreePath
+from zstate.buffer.history import insert_together, keep_only_around
+from zstate.buffer.history_view import HistoryView
+from zstate.buffer.path import TransformPath, compile_path
+from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track, TrackOwner
 from zstate.buffer.waiting import WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
-from zstate.errors import (
-    InsertRefused,
-    InvalidInput,
-)
+from zstate.errors import InsertRefused, InvalidInput
 from zstate.model.robot import RobotModel
 from zstate.transform import UPPER_TRIANGLE, Transform
 
 # The number of pairs of frames whose paths are cached; more than any program uses on purpose.
 _MAX_CACHED_PATHS = 4096
 
+CachedPath: TypeAlias = tuple[int, Callable[[object], Transform | None], TransformPath, PathDependencies]
+"""The version of the tree at which a path is valid, its ``at``, the path, and what it depends on.
 
-class CachedPath(NamedTuple):
-    """A compiled path, valid at the ``version`` of the tree and while its ``dependencies`` are current."""
-
-    version: int
-    path: TransformPath
-    dependencies: PathDependencies
+A plain tuple, and ``at`` looked up before: a lookup by name unpacks it in a tenth of its time.
+"""
 
 
 class BufferCore:
@@ -201,7 +189,11 @@ class BufferCore:
             text = f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves"
             raise InsertRefused(text, reason="no stamp", edge=edge)
         covariance = transform.covariance
-        triangle = None if covariance is None else covariance[UPPER_TRIANGLE][None]
+        triangle = None
+        if covariance is not None:
+            import_module("zstate.buffer.covariance_path")  # here, not in a lookup later
+
+            triangle = covariance[UPPER_TRIANGLE][None]
         return self._insert_poses((edge,), transform.stamp, transform.pose7[None], triangle, writer)
 
     def insert_many(
@@ -237,7 +229,11 @@ class BufferCore:
             names = tuple((parent, child) for parent, child in edges)
         except (TypeError, ValueError):
             raise InvalidInput(f"edges are pairs (parent, child) of frame names; got {edges!r}") from None
-        triangles = None if covariances is None else check_covariances(names, covariances)
+        triangles = None
+        if covariances is not None:
+            from zstate.buffer.covariance_path import check_covariances  # noqa: PLC0415 - most edges have none
+
+            triangles = check_covariances(names, covariances)
         return self._insert_poses(names, check_stamp(stamp), check_poses(names, poses), triangles, writer)
 
     def _insert_poses(
@@ -352,10 +348,10 @@ class BufferCore:
         """The cached path between two frames; a new one without the extension if not ``compiled``."""
         check_names(target, source)
         if compiled:
-            return self._cached_path(target, source).path
+            return self._cached_path(target, source)[2]
         with self._lock:
             edges = self._tree.path(target, source)
-            return compile_path_with_covariances(target, source, edges, self._read_views, compiled=False)
+            return self._compiled_path(target, source, edges, compiled=False)
 
     def _paths_of(self, *pairs: tuple[str, str]) -> list[TransformPath]:
         """The paths between pairs of frames, all of them of one state of the tree."""
@@ -368,19 +364,32 @@ class BufferCore:
 
     def _cached_path(self, target: str, source: str) -> CachedPath:
         version, cached = self._tree.version, self._paths.get((target, source))
-        if cached is not None and cached.version == version:
+        if cached is not None and cached[0] == version:
             return cached
-        if cached is not None and self._tree.is_current(cached.dependencies):
-            cached = cached._replace(version=version)
+        if cached is not None and self._tree.is_current(cached[3]):
+            cached = version, *cached[1:]
         else:
             with self._lock:
                 edges = self._tree.path(target, source)
-                path = compile_path_with_covariances(target, source, edges, self._read_views)
-                cached = CachedPath(self._tree.version, path, edges.dependencies)
+                path = self._compiled_path(target, source, edges)
+                cached = self._tree.version, path.at, path, edges.dependencies
         if len(self._paths) >= _MAX_CACHED_PATHS:
             self._paths = {}
         self._paths[target, source] = cached
         return cached
+
+    def _compiled_path(
+        self, target: str, source: str, edges: TreePath, *, compiled: bool = True
+    ) -> TransformPath:
+        """The path over ``edges``; its transforms have covariances if all its edges can have them."""
+        path = compile_path(target, source, edges, self._read_views, compiled=compiled)
+        uncertain = [use.track for use in path.uses if isinstance(use.track, PoseTrack)]
+        if uncertain and all(track.has_covariances for track in uncertain):
+            # Loaded since the first covariance was inserted.
+            from zstate.buffer.covariance_path import CovariancePath  # noqa: PLC0415
+
+            return CovariancePath(path)
+        return path
 
     def _read_views(self, tracks: Sequence[Track]) -> list[HistoryView]:
         """The views of several tracks at one moment between writes."""

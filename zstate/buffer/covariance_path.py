@@ -1,7 +1,7 @@
 """Paths whose samples have covariances: the covariance of each transform, composed along the path.
 
 Static edges and the joints of a model, as exact as their positions, add nothing. Every other moving edge adds
-its own covariance, carried to the source's origin (``se3.carry_covariance``); their errors are taken as
+its own covariance, carried to the source's origin (``carry_covariance``); their errors are taken as
 independent. If one of these edges has none, that of the transform is not known: unknown is not zero. Between
 two samples a covariance is interpolated linearly, which keeps it positive semidefinite. A prediction has
 none, because nothing states how fast its error grows.
@@ -15,27 +15,19 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from zstate import se3
-from zstate.buffer.frame_tree import TreePath
 from zstate.buffer.interpolation import Bracket, PoseStep, Step, bracket_at, chain_pose
-from zstate.buffer.path import Stamps, TransformPath, ViewReader, Views, compile_path
+from zstate.buffer.path import Stamps, TransformPath, Views
 from zstate.buffer.tracks import PoseTrack
-from zstate.checks import Points
-from zstate.transform import UPPER_TRIANGLE, PoseWithCovariance, Transform
+from zstate.checks import Points, real_numbers
+from zstate.covariance import carry_covariance
+from zstate.errors import InsertRefused, InvalidInput
+from zstate.transform import COVARIANCE_NUMBERS, UPPER_TRIANGLE, PoseWithCovariance, Transform
 
-
-def compile_path_with_covariances(
-    target: str, source: str, edges: TreePath, read_views: ViewReader, *, compiled: bool = True
-) -> TransformPath:
-    """As ``compile_path``; the path's transforms have covariances if all its edges can have them."""
-    path = compile_path(target, source, edges, read_views, compiled=compiled)
-    tracks = [edge.track for edge in (*edges.to_target, *edges.to_source)]
-    uncertain = [track for track in tracks if isinstance(track, PoseTrack)]
-    if uncertain and all(track.has_covariances for track in uncertain):
-        return CovariancePath(path)
-    return path
+# The places of the six variances in an upper triangle, row by row.
+_VARIANCES = [0, 6, 11, 15, 18, 20]
 
 
 class CovariancePath(TransformPath):
@@ -116,7 +108,7 @@ class CovariancePath(TransformPath):
                     x, y, z, *_ = target_from_child
                     arm = (source_x - x, source_y - y, source_z - z)
                     covariance = _interpolated(brackets[place[0]], place[1])
-                    total += se3.carry_covariance(covariance, target_from_parent[3:], arm)
+                    total += carry_covariance(covariance, target_from_parent[3:], arm)
                 target_from_parent = target_from_child
         return total[UPPER_TRIANGLE].tolist()
 
@@ -131,3 +123,25 @@ def _interpolated(now: Bracket, columns: slice) -> NDArray[np.float64]:
     matrix = np.empty((6, 6))
     matrix[UPPER_TRIANGLE] = matrix.T[UPPER_TRIANGLE] = (1.0 - now.ratio) * before + now.ratio * after
     return matrix
+
+
+def check_covariances(edges: Sequence[tuple[str, str]], covariances: ArrayLike) -> NDArray[np.float64]:
+    """``covariances`` as (N, 21). Raises InvalidInput or InsertRefused for a variance that cannot be one."""
+    array = real_numbers(covariances, "covariances")
+    if array.shape != (len(edges), COVARIANCE_NUMBERS):
+        raise InvalidInput(
+            f"{len(edges)} edges take covariances of shape ({len(edges)}, {COVARIANCE_NUMBERS}), the upper "
+            f"triangles row by row; got {array.shape}"
+        )
+    # NaN is not below zero: it marks a covariance that is not known.
+    is_wrong = (array[:, _VARIANCES] < 0.0).any(axis=1) | np.isinf(array).any(axis=1)
+    if is_wrong.any():
+        first = int(is_wrong.argmax())
+        parent, child = edges[first]
+        raise InsertRefused(
+            f"{parent!r} -> {child!r}: variances are finite and not negative; got "
+            f"{array[first, _VARIANCES].tolist()}",
+            reason="not a covariance",
+            edge=(parent, child),
+        )
+    return array

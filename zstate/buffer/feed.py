@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
+from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.frame_tree import Edge, FrameTree, TreeSnapshot
-from zstate.buffer.history import FastPath, History, HistoryView, merged
+from zstate.buffer.history import FastPath, History, merged
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, checked_rows
 from zstate.buffer.tracks import ClockOffsets, JointTrack, PoseTrack, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
@@ -267,6 +269,9 @@ class BufferFeed:
         ``stamps`` (T,) [ns] ascend, at least one; ``poses`` are (T, 7) and ``covariances`` (T, 21), NaN if
         not known. Raises InsertRefused as ``insert_many``.
         """
+        if covariances is not None:
+            import_module("zstate.buffer.covariance_path")  # here, not in a lookup later
+
         with self._lock:
             ((track, _),) = self._pose_tracks.track_rows((edge,), int(stamps[-1]), None)
             rows = poses

@@ -15,7 +15,6 @@ from operator import itemgetter
 from typing import Literal, NamedTuple
 
 from zstate import se3
-from zstate._util.format import html_of_fields
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.edge_rules import by, loop_refusal
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
@@ -80,6 +79,8 @@ class FrameInfo:
     joint: str | None = None
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_of_fields  # noqa: PLC0415 - for notebooks alone
+
         return html_of_fields(self)
 
     def newest_in(self, domain: str) -> int | None:

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate import se3
-from zstate.buffer.history import HistoryView
-from zstate.model.joint_transforms import JointTransform
+from zstate.buffer.history_view import HistoryView
+from zstate.model.joint_forms import JointTransform
 from zstate.se3 import Backend, Component, Pose, Vector
 
 Row: TypeAlias = Sequence[Component]
@@ -220,7 +220,7 @@ class StaticStep:
 
 @dataclass(frozen=True, slots=True)
 class JointStep:
-    """A revolute, continuous, prismatic or planar joint; ``zstate.model.joint_transforms`` has the formulas.
+    """A revolute, continuous, prismatic or planar joint; ``zstate.model.joint_forms`` has the formulas.
 
     A planar joint has three interpolators, one after the other: x, y and yaw.
     """

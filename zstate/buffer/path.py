@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from zstate import se3
-from zstate.buffer.frame_tree import Edge, FrameTree, TreePath
-from zstate.buffer.history import HistoryView
+from zstate.buffer.frame_tree import Edge, TreePath
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.interpolation import (
     ContinuousAngleInterpolator,
     Interpolator,
@@ -38,10 +38,9 @@ from zstate.buffer.interpolation import (
 )
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
 from zstate.checks import Points
-from zstate.clock import check_stamp, check_stamps
-from zstate.errors import InFuture, InPast, InvalidInput, LookupFailed, NoData, NotFinite, Stale
+from zstate.errors import InFuture, InPast, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
-from zstate.model.joint_transforms import JointTransform
+from zstate.model.joint_forms import JointTransform
 from zstate.transform import Kind, Transform
 
 if TYPE_CHECKING or kernel == "c":
@@ -392,7 +391,8 @@ class CompiledPath(TransformPath):
         windows = self._compiled.place(points, stamps, placed, valid)
         rest = ~valid
         if rest.any():
-            rest &= np.isfinite(points).all(axis=1)
+            for numbers in points.T:  # in a fifth of the time of all(axis=1)
+                rest &= np.isfinite(numbers)
         if rest.any():  # as in poses
             their_stamps = stamps if len(stamps) == 1 else stamps[rest]
             views = self._views_of(windows)
@@ -501,56 +501,3 @@ def transforms_at_one_moment(
     views = dict(zip(tracks, first.read_views(tracks), strict=True))
     transform = first.transform_in([views[use.track] for use in first.uses], first_at)
     return transform, second.transform_in([views[use.track] for use in second.uses], second_at)
-
-
-class Plan:
-    """Compiled lookup of ``target_from_source``: ``buffer.lookup`` without the search for names.
-
-    Made by ``TransformBuffer.plan``; follows the buffer when frames are added or withdrawn.
-    """
-
-    def __init__(
-        self, target: str, source: str, tree: FrameTree, current_path: Callable[[], TransformPath]
-    ) -> None:
-        self.target = target
-        self.source = source
-        self._tree = tree
-        self._current_path = current_path
-        self._cached = tree.version, current_path()
-
-    def __repr__(self) -> str:
-        return f"<plan of {self.source!r} in {self.target!r}>"
-
-    def at(self, stamp: int | None = None) -> Transform:
-        """The transform at ``stamp`` [ns], or at the newest common instant. Never predicts.
-
-        Raises LookupFailed as ``TransformBuffer.lookup`` does.
-        """
-        version, path = self._cached
-        if version != self._tree.version:
-            # The version is read first: a path newer than its version is compiled again, never kept.
-            self._cached = self._tree.version, self._current_path()
-            path = self._cached[1]
-        transform = path.at(stamp)
-        if transform is not None:
-            return transform
-        return path.transform(None if stamp is None else check_stamp(stamp))
-
-    def poses(self, stamps: ArrayLike, out: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """pose7 at each of ``stamps``: (T, 7), written into ``out`` if given.
-
-        Raises LookupFailed for the first stamp without a transform; ``out`` is then unchanged.
-        """
-        instants = check_stamps(stamps)
-        if out is not None and (out.shape != (len(instants), 7) or out.dtype != np.float64):
-            raise InvalidInput(f"out must be ({len(instants)}, 7) float64; got {out.shape} {out.dtype}")
-        path = self._current_path()
-        poses, valid = path.poses(instants)
-        while not valid.all():
-            # A lookup of the first missing stamp raises the reason, unless its sample has arrived since.
-            path.transform(int(instants[valid.argmin()]))
-            poses, valid = path.poses(instants)
-        if out is None:
-            return poses
-        out[...] = poses
-        return out

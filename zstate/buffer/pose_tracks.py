@@ -27,9 +27,6 @@ TrackRows: TypeAlias = list[tuple[PoseTrack, list[int]]]
 # Limit of the edges in the cache of orders: a writer may shuffle its edges from sample to sample.
 _MAX_CACHED_EDGES = 100_000
 
-# The places of the six variances in an upper triangle, row by row.
-_VARIANCES = [0, 6, 11, 15, 18, 20]
-
 
 class TooOld(Exception):
     """A sample is older than the history of one of its edges reaches; nothing was changed."""
@@ -144,28 +141,6 @@ def second_writer(parent: str, child: str, existing: Edge, writer: str | None) -
     return InsertRefused(f"{text}; one edge has one writer", reason="second writer", edge=(parent, child))
 
 
-def check_covariances(edges: Sequence[EdgeNames], covariances: ArrayLike) -> NDArray[np.float64]:
-    """``covariances`` as (N, 21). Raises InvalidInput or InsertRefused for a variance that cannot be one."""
-    array = real_numbers(covariances, "covariances")
-    if array.shape != (len(edges), COVARIANCE_NUMBERS):
-        raise InvalidInput(
-            f"{len(edges)} edges take covariances of shape ({len(edges)}, {COVARIANCE_NUMBERS}), the upper "
-            f"triangles row by row; got {array.shape}"
-        )
-    # NaN is not below zero: it marks a covariance that is not known.
-    is_wrong = (array[:, _VARIANCES] < 0.0).any(axis=1) | np.isinf(array).any(axis=1)
-    if is_wrong.any():
-        first = int(is_wrong.argmax())
-        parent, child = edges[first]
-        raise InsertRefused(
-            f"{parent!r} -> {child!r}: variances are finite and not negative; got "
-            f"{array[first, _VARIANCES].tolist()}",
-            reason="not a covariance",
-            edge=(parent, child),
-        )
-    return array
-
-
 def check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
     """``poses`` as (N, 7), quaternions of length one. Raises InvalidInput or InsertRefused."""
     array = real_numbers(poses, "poses")
@@ -195,6 +170,8 @@ def checked_rows(
     rows = check_poses(edges, np.concatenate(poses)).reshape(count, -1)
     if not track.has_covariances:
         return rows
+    from zstate.buffer.covariance_path import check_covariances  # noqa: PLC0415 - loaded, as it has some
+
     missing = np.full((len(track.edges), COVARIANCE_NUMBERS), np.nan)
     triangles = np.concatenate([missing if known is None else known for known in covariances])
     return np.hstack((rows, check_covariances(edges, triangles).reshape(count, -1)))

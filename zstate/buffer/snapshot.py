@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from zstate import se3
 from zstate.buffer.frame_tree import Edge, TreeSnapshot
-from zstate.buffer.history import HistoryView
+from zstate.buffer.history_view import HistoryView
 from zstate.buffer.interpolation import rows_around
 from zstate.buffer.path import ViewReader
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track

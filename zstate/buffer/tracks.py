@@ -10,13 +10,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.history import History, HistoryView
+from zstate.buffer.history import History
+from zstate.buffer.history_view import HistoryView
 from zstate.clock import ClockOffset
 from zstate.errors import InsertRefused
-from zstate.model.joint_history import JointHistory
-from zstate.model.joint_transforms import JointTransform, shared_transforms
+from zstate.model.joint_forms import JointTransform
+from zstate.model.joint_transforms import shared_transforms
 from zstate.model.kinematics import Kinematics
-from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.model.robot import RobotModel
 from zstate.transform import COVARIANCE_NUMBERS
 
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
@@ -54,7 +55,33 @@ class TrackOwner:
         raise InsertRefused(text, reason=reason, edge=edge)
 
 
-class JointTrack:
+class _Samples:
+    """The ``history`` of a track."""
+
+    history: History
+
+    @property
+    def newest(self) -> int | None:
+        """The stamp of the newest sample [ns]; None without any."""
+        return self.history.newest
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The mean rate of the samples kept [Hz]; None with fewer than two."""
+        return coverage(self.history.view).rate_hz
+
+    def widen(self, columns: int) -> None:
+        """Add columns to the rows, NaN in the samples so far: in another history, which takes its place."""
+        self.history.close()
+        old = self.history.view
+        wider = History(self.history.width + columns, self.history.span_ns)
+        wider.replace(
+            old.kept_stamps(), np.pad(old.kept_rows(), ((0, 0), (0, columns)), constant_values=np.nan)
+        )
+        self.history = wider
+
+
+class JointTrack(_Samples):
     """The joint positions of one robot, and its velocities from the first sample that has them.
 
     A row is the positions in the order of ``model.joint_names``, then the velocities; velocities
@@ -87,16 +114,6 @@ class JointTrack:
     def name(self) -> str:
         """The robot."""
         return self.prefix or self.model.name
-
-    @property
-    def newest(self) -> int | None:
-        """The stamp of the newest sample [ns]; None without any."""
-        return self.history.newest
-
-    @property
-    def rate_hz(self) -> float | None:
-        """The mean rate of the samples kept [Hz]; None with fewer than two."""
-        return coverage(self.history.view).rate_hz
 
     @property
     def has_velocities(self) -> bool:
@@ -135,12 +152,7 @@ class JointTrack:
     ) -> bool:
         """Insert one instant; False if it is older than the history reaches."""
         if velocities is not None and not self.has_velocities:
-            self.history.close()
-            old = self.history.view
-            missing = np.full((old.size, self.model.velocity_count), np.nan)
-            wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
-            wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
-            self.history = wider
+            self.widen(self.model.velocity_count)
         return self.history.insert(stamp, self.row(positions, velocities))
 
     def row(
@@ -153,25 +165,8 @@ class JointTrack:
             velocities = np.full(self.model.velocity_count, np.nan)
         return np.concatenate((positions, velocities))
 
-    def samples(self, view: HistoryView, start: int | None, end: int | None) -> JointHistory:
-        """Copies of the samples in ``view`` with stamps in [start, end) [ns]; None is no limit."""
-        coordinates = coordinate_names(self.model)
-        stamps = view.kept_stamps()
-        first = 0 if start is None else int(stamps.searchsorted(start))
-        last = len(stamps) if end is None else int(stamps.searchsorted(end))
-        rows = view.kept_rows()[first:last].copy()
-        positions, velocities = rows[:, : self.position_count], rows[:, self.position_count :]
-        return JointHistory(
-            self.model.joint_names,
-            coordinates,
-            tuple(coordinates[column] for column in velocity_columns_by_position(self.model)),
-            stamps[first:last].copy(),
-            positions,
-            None if np.isnan(velocities).all() else velocities,
-        )
 
-
-class PoseTrack:
+class PoseTrack(_Samples):
     """Poses of one or several moving edges that one publisher always sends together.
 
     Columns 7 i to 7 i + 7 of a row are ``parent_from_child`` of ``edges[i]``. From the first sample with
@@ -194,16 +189,6 @@ class PoseTrack:
         return f"{first} and {more} more" if more else first
 
     @property
-    def newest(self) -> int | None:
-        """The stamp of the newest sample [ns]; None without any."""
-        return self.history.newest
-
-    @property
-    def rate_hz(self) -> float | None:
-        """The mean rate of the samples kept [Hz]; None with fewer than two."""
-        return coverage(self.history.view).rate_hz
-
-    @property
     def has_covariances(self) -> bool:
         """Whether rows have columns for covariances."""
         return self.history.width > 7 * len(self.edges)
@@ -220,12 +205,7 @@ class PoseTrack:
     def row(self, poses: NDArray[np.float64], covariances: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """A row of the history: ``poses`` (N, 7), and ``covariances`` (N, 21) if they are known."""
         if covariances is not None and not self.has_covariances:
-            self.history.close()
-            old = self.history.view
-            missing = np.full((old.size, COVARIANCE_NUMBERS * len(self.edges)), np.nan)
-            wider = History((7 + COVARIANCE_NUMBERS) * len(self.edges), self.history.span_ns)
-            wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
-            self.history = wider
+            self.widen(COVARIANCE_NUMBERS * len(self.edges))
         if not self.has_covariances:
             return poses.ravel()
         if covariances is None:

@@ -24,6 +24,7 @@ import math
 import operator
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import Any, get_args
 
 import numpy as np
@@ -35,6 +36,8 @@ from zstate.checks import check_names, check_points, real_numbers, reduced_to_fi
 from zstate.errors import InvalidInput
 from zstate.wire.keys import full_name
 from zstate.wire.messages import from_block, to_block
+
+import_module("zstate.buffer.projection")  # before a loop calls ``TransformBuffer.project``
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

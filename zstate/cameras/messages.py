@@ -10,7 +10,8 @@ from zstate._util.format import SECOND_NS
 from zstate.cameras.pictures import PictureFormat, check_picture, picture_size
 from zstate.errors import InvalidInput
 from zstate.message import Count, StampedMessage
-from zstate.wire.messages import Interval, check_finite, check_frame, from_block
+from zstate.wire.measurements import check_finite, check_frame
+from zstate.wire.messages import Interval, from_block
 
 CameraModel: TypeAlias = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 """The distortions of sensor_msgs/distortion_models.hpp; see zstate.cameras.camera."""

@@ -15,13 +15,13 @@ from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.session import Session
 from zstate.net.writer import write_all
+from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.nodes.robot_writer import RobotWriter
-from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
-from zstate.plugins import stream_named
 from zstate.rate import RateReport
+from zstate.stream_registry import stream_named
 from zstate.wire.keys import check_writer, full_name
-from zstate.wire.messages import renumbered
+from zstate.wire.measurements import renumbered
 
 _ENVELOPE_BYTES = 5_000
 """What a message has beside its picture, at most: names of 1024 characters of 4 bytes."""

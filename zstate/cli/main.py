@@ -26,7 +26,8 @@ from zstate.cli.commands import SECTIONS, load_command, load_other_command, own_
 from zstate.cli.output import logs
 from zstate.cli.signals import Ending
 from zstate.errors import ZStateError
-from zstate.plugins import built_in_plugins, other_plugins
+from zstate.other_plugins import other_plugins
+from zstate.plugins import built_in_plugins
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -220,7 +221,7 @@ def _completed_type(command: str, argument: click.Argument) -> Any:
 
 
 def _announced_names(ctx: click.Context, incomplete: str) -> Iterator[str]:
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
 
     with suppress(ZStateError), _opened_session(ctx) as session:  # the command reports errors
         robots = discover(session, _ROBOTS_WITHIN_S, wire=ctx.params.get("wire") or "native")

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -51,6 +52,19 @@ def number(metavar: str, check: Callable[[float], float]) -> Checked:
     return Checked(metavar, lambda value: check(click.FLOAT.convert(value, None, None)))
 
 
+def _parse_time(text: str) -> int:
+    """The stamp [ns] of ``text``: UTC in ISO 8601, or itself."""
+    if re.fullmatch(r"\d{15,19}", text, re.ASCII):
+        return int(text)
+    try:
+        instant = datetime.fromisoformat(text)
+    except ValueError:
+        raise InvalidInput(f"{text!r} is no time like 2026-11-20T14:03, and no stamp [ns]") from None
+    if instant.tzinfo is None:
+        instant = instant.replace(tzinfo=UTC)
+    return (instant - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+
+
 def _check_rate(rate_hz: float) -> float:
     from zstate.rate import check_rate  # loads numpy, which --help does not need
 
@@ -72,7 +86,7 @@ class StreamChoice(click.Choice[str]):
 
     @property
     def choices(self) -> Sequence[str]:
-        from zstate.plugins import streams_where
+        from zstate.stream_registry import streams_where
 
         return streams_where(self._condition)
 
@@ -98,6 +112,34 @@ class _Model(click.types.StringParamType):
 MODEL = _Model()
 RATE = number("HZ", _check_rate)
 SECONDS = number("S", _check_seconds)
+
+TIME = Checked("TIME", _parse_time)
+"""UTC as 2026-11-20T14:03, 2026-11-20T14:03:05.25, or a stamp in nanoseconds; the value is a stamp [ns]."""
+
+_MINUTE_NS = 60 * 10**9
+_WINDOW_OPTIONS = (
+    click.option("--at", type=TIME, help="Of an archive: the minute from this time (UTC) on."),
+    click.option("--from", "start_stamp", type=TIME, help="Of an archive: from this time on."),
+    click.option("--to", "end_stamp", type=TIME, help="Of an archive: up to this time."),
+)
+
+
+def window_options(command: Command) -> Command:
+    """Add the options of a window of an archive: the command receives ``window``, two stamps or None."""
+
+    @functools.wraps(command)
+    def with_window(*, at: int | None, start_stamp: int | None, end_stamp: int | None, **params: Any) -> Any:
+        window = None
+        if at is not None and start_stamp is None and end_stamp is None:
+            window = at, at + _MINUTE_NS
+        elif at is None and start_stamp is not None and end_stamp is not None:
+            window = start_stamp, end_stamp
+        elif (at, start_stamp, end_stamp) != (None, None, None):
+            raise click.UsageError("name the window by --at TIME, or by --from TIME --to TIME")
+        return command(window=window, **params)
+
+    return _with_options(with_window, _WINDOW_OPTIONS)
+
 
 EXISTING_FILE = click.Path(exists=True, dir_okay=False)
 

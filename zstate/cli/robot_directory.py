@@ -10,7 +10,7 @@ from zstate.cli.output.console import fail
 from zstate.cli.output.wire_text import NativeMessages, is_ros, messages_for
 
 if TYPE_CHECKING:
-    from zstate.net.presence import RobotInfo
+    from zstate.net.discovery import RobotInfo
     from zstate.net.session import Session
     from zstate.streams import StreamName
     from zstate.wire.identity import Announcement
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     """``robot`` as it is announced, or all robots for "*". Fails if there is none."""
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.wire.keys import ANY, check_robot
 
     if robot != ANY:
@@ -76,7 +76,7 @@ class RobotDirectory(Closeable):
 
     def robots(self) -> tuple[RobotInfo, ...]:
         """Robots with at least one writer, as ``discover`` returns them."""
-        from zstate.net.presence import by_robot
+        from zstate.net.discovery import by_robot
 
         return by_robot(self._announced.copy())
 

@@ -46,7 +46,7 @@ class SessionOptions:
     @property
     def joins_as(self) -> str:
         """The mode, or the one that the other options imply."""
-        from zstate.net.config import implied_mode
+        from zstate.net.environment import implied_mode
 
         return self.mode or implied_mode(self.connect, self.listen, self.config)
 

@@ -14,7 +14,7 @@ from zstate.clock import LONGEST_WAIT_S
 from zstate.net.presence import announce_reader
 from zstate.net.streams import BULK_CAPACITY, CAPACITY
 from zstate.net.subscription import Received, subscribe
-from zstate.plugins import is_bulk
+from zstate.stream_registry import is_bulk
 from zstate.streams import StreamName
 from zstate.wire.keys import check_robot
 from zstate.wire.messages import Message

@@ -10,7 +10,7 @@ from msgspec import Meta
 from zstate.errors import InvalidInput
 from zstate.message import Count, StampedMessage
 from zstate.streams import MEGABYTE
-from zstate.wire.messages import check_frame
+from zstate.wire.measurements import check_frame
 
 CLOUD_POINTS = 4_000_000
 """The most points of a cloud."""

@@ -15,7 +15,7 @@ from zstate.clouds.cloud import TIME_FIELDS, Cloud, cloud_to_message
 from zstate.clouds.messages import check_counts
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
-from zstate.nodes.sample_publisher import MeasurementPublisher
+from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.rate import RateReport
 from zstate.wire.keys import full_name
 

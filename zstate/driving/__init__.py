@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from zstate.driving.commander import Commander
     from zstate.driving.driver import Calibration, Driver, Setpoint
     from zstate.driving.driver_state import DriverReport
+    from zstate.driving.errors import DriverFault, MotionRefused, MotionTimeout
     from zstate.driving.host import DriverHost
     from zstate.driving.limits import Limits
     from zstate.driving.motion import Motion, Outcome
@@ -19,10 +20,13 @@ __all__ = [
     "Calibration",
     "Commander",
     "Driver",
+    "DriverFault",
     "DriverHost",
     "DriverReport",
     "Limits",
     "Motion",
+    "MotionRefused",
+    "MotionTimeout",
     "Outcome",
     "Setpoint",
     "SetpointLimiter",
@@ -34,10 +38,13 @@ _HOMES = {
     "Calibration": "driver",
     "Commander": "commander",
     "Driver": "driver",
+    "DriverFault": "errors",
     "DriverHost": "host",
     "DriverReport": "driver_state",
     "Limits": "limits",
     "Motion": "motion",
+    "MotionRefused": "errors",
+    "MotionTimeout": "errors",
     "Outcome": "motion",
     "Setpoint": "driver",
     "SetpointLimiter": "setpoint_limiter",

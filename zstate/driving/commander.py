@@ -18,6 +18,7 @@ from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.checks import real_numbers
 from zstate.driving.commands import check_named
 from zstate.driving.driver_state import SILENT_S, cached_state
+from zstate.driving.errors import MotionRefused
 from zstate.driving.messages import (
     GOAL_TIME_S,
     GOAL_TOLERANCE,
@@ -35,15 +36,7 @@ from zstate.driving.messages import (
 )
 from zstate.driving.motion import Motion, Points, check_by_joint, rows_block
 from zstate.driving.transit import REQUEST_TTL_NS, CommandWindow, DriverClock
-from zstate.errors import (
-    Closed,
-    InvalidInput,
-    MessageError,
-    MotionRefused,
-    Unreachable,
-    ZStateError,
-    format_duration,
-)
+from zstate.errors import Closed, InvalidInput, MessageError, Unreachable, ZStateError, format_duration
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer

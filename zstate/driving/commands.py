@@ -24,7 +24,7 @@ from zstate.driving.transit import CommandAdmission
 from zstate.errors import InvalidInput, MessageError, format_duration, printable
 from zstate.net.presence import announce
 from zstate.net.session import Session
-from zstate.net.streams import StreamInbox
+from zstate.net.stream_inbox import StreamInbox
 from zstate.wire.keys import shortened, stream_key
 from zstate.wire.messages import from_block
 from zstate.wire.native import decode

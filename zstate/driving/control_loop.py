@@ -19,13 +19,14 @@ from zstate.checks import Floats
 from zstate.clock import Clock, MonotonicClock
 from zstate.driving.commands import Command, Targets
 from zstate.driving.driver import Setpoint, StopMode
+from zstate.driving.errors import DriverFault
 from zstate.driving.limits import Limits
 from zstate.driving.motion_service import MotionExecutor, Present
 from zstate.driving.readings import Readings
 from zstate.driving.setpoint_limiter import Limited, SetpointLimiter
 from zstate.driving.stops import LatchedStops, StopRegister
 from zstate.driving.supervised_driver import FollowingCheck, SupervisedDriver
-from zstate.errors import Closed, DriverFault, InvalidInput, MessageError, SecondWriter, format_duration
+from zstate.errors import Closed, InvalidInput, MessageError, SecondWriter, format_duration
 from zstate.sources import JointReading
 
 _LOG = logging.getLogger("zstate")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.bounded import BoundedDict
-from zstate._util.closeable import Closeable, held_back_signals
+from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
 from zstate.driving.commands import CommandReceiver
@@ -32,6 +32,7 @@ from zstate.driving.driver_state import (
     SetpointPublisher,
     check_only_host,
 )
+from zstate.driving.held_back_signals import held_back_signals
 from zstate.driving.limits import Limits
 from zstate.driving.messages import DriverState, Mode
 from zstate.driving.motion_service import MotionService

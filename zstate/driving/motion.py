@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from zstate._util.fork_safe import fork_safe
 from zstate.checks import real_numbers
+from zstate.driving.errors import MotionTimeout
 from zstate.driving.messages import DriverState, OutcomeName
-from zstate.errors import InvalidInput, MotionTimeout
+from zstate.errors import InvalidInput
 from zstate.net.queryable import check_timeout
 from zstate.wire.messages import to_block
 

@@ -49,7 +49,8 @@ from zstate.driving.messages import (
 from zstate.driving.trajectory import Trajectory
 from zstate.driving.transit import REQUEST_TTL_NS, CommandAges, check_waited
 from zstate.errors import InvalidInput, MessageError, format_duration
-from zstate.net.queryable import Reply, RequestAnswer, RequestQueryable
+from zstate.net.queryable import Reply
+from zstate.net.request_queryable import RequestAnswer, RequestQueryable
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import MOTION

@@ -22,7 +22,8 @@ from typing import Any, TypeVar
 from zstate.driving.messages import DriverState, JointCommand, Stop, state_text
 from zstate.errors import InvalidInput
 from zstate.wire.identity import WriterId
-from zstate.wire.messages import message_fields, message_from_fields, order_digest
+from zstate.wire.measurements import message_fields, message_from_fields
+from zstate.wire.messages import order_digest
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.streams import RecordedForm
 from zstate.wire.ros2.types import DIAGNOSTIC_ARRAY, JOINT_STATE

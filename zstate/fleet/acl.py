@@ -23,9 +23,9 @@ from functools import partial
 from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.net.config import user_config
 from zstate.net.security.credentials import check_identity
-from zstate.plugins import all_streams, is_named, latched_streams, own_streams
+from zstate.net.user_config import user_config
+from zstate.stream_registry import all_streams, is_named, latched_streams, own_streams
 from zstate.wire.keys import (
     CLOCK_KEY,
     EDGE_TOKEN,

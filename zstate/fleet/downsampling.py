@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from zstate.errors import InvalidInput
 from zstate.fleet.acl import Rule, check_namespace
-from zstate.plugins import streams_where
+from zstate.stream_registry import streams_where
 from zstate.streams import StreamName
 from zstate.wire.keys import check_robot, stream_expression
 

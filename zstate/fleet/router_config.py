@@ -15,8 +15,32 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.downsampling import Downsampling
 from zstate.fleet.uplink import Uplink
-from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
+from zstate.net.config import ROUTER_ENDPOINT, SETTINGS, check_credentials, endpoint_list
 from zstate.net.security.credentials import Credentials
+
+ROS_ROUTER: dict[str, object] = {
+    "mode": "router",
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+    "routing": {"router": {"peers_failover_brokering": False}},
+    "timestamping": {"enabled": True},
+    # Many nodes start at once, and are busy with that for a while.
+    "queries_default_timeout": 600_000,
+    "transport": {
+        "unicast": {
+            "open_timeout": 60_000,
+            "accept_timeout": 60_000,
+            "accept_pending": 10_000,
+            "max_sessions": 10_000,
+        },
+        "link": {"tx": {"lease": 60_000, "keep_alive": 2}},
+        "shared_memory": {"enabled": False},
+    },
+}
+"""The settings of rmw_zenohd, except that it listens at tcp/[::]:7447, which is open to the network.
+
+ROS nodes are peers. They find each other through the router's gossip and exchange data directly; the router
+forwards between peers and clients.
+"""
 
 _WIDTH = 100
 _INDENT = "  "

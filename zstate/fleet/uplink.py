@@ -14,7 +14,7 @@ from zstate.errors import ConfigError, InvalidInput
 from zstate.fleet.acl import ALL_KEYS, MESSAGES, Rule, check_namespace
 from zstate.fleet.downsampling import check_rates, rate_rules
 from zstate.net.sites import UPLINK_OF
-from zstate.plugins import all_streams
+from zstate.stream_registry import all_streams
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY, RELEASE, STATUS, check_robot, stream_expression
 

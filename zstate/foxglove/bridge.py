@@ -16,11 +16,11 @@ from zstate.foxglove.server import FoxgloveServer, ServedChannel, ServedMessage
 from zstate.ingest.counters import Counters
 from zstate.net.presence import LivelinessToken, WriterWatch, announce_reader
 from zstate.net.session import Session
-from zstate.plugins import is_bulk, is_latched
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.recorder import MessageQueue, SampleRecorder, recorded_streams
 from zstate.recording.storage import ROBOT, ChannelType
+from zstate.stream_registry import is_bulk, is_latched
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, STOP_STREAMS, check_robot

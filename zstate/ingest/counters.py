@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 import sys
 from collections import Counter
-from collections.abc import Hashable
 from dataclasses import dataclass
 
 from zstate._util.bounded import MAX_ENTRIES, BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.format import html_of_fields
 from zstate._util.refusals import Refusals
 
 _LOG = logging.getLogger("zstate")
@@ -39,6 +37,8 @@ class ListenerStats:
     off_clock: int = 0
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_of_fields  # noqa: PLC0415 - for notebooks alone
+
         return html_of_fields(self)
 
 
@@ -158,34 +158,3 @@ class SequenceNumbers:
     def recall(self, seq: int) -> None:
         """Note that the sample ``seq`` was inserted from the writer's cache."""
         self.newest_recalled = max(self.newest_recalled, seq)
-
-
-class GapCounter:
-    """Counts the samples missing from each writer: "dropped" by this process, or "missed" before it."""
-
-    def __init__(self, counters: Counters) -> None:
-        self._counters = counters
-        self._next: BoundedDict[Hashable, int] = BoundedDict()
-        self._is_overflowed = False
-        self._overflowed: set[Hashable] = set()
-
-    def start_batch(self, *, overflowed: bool) -> None:
-        """Start a batch; ``overflowed`` if the receiver's ring lost samples before it, or in it.
-
-        If so, gaps in this batch count as "dropped", and so does the next gap of each writer that has no
-        sample in it.
-        """
-        self._is_overflowed = overflowed
-        if overflowed:
-            self._overflowed = set(self._next)
-
-    def add(self, writer: Hashable, seq: int) -> int:
-        """Count what is missing before sample ``seq`` of ``writer``, and return how many these are."""
-        expected = self._next.get(writer, seq)
-        missing = max(seq - expected, 0)
-        if missing:
-            is_own = self._is_overflowed or writer in self._overflowed
-            self._counters.count("dropped" if is_own else "missed", missing)
-        self._overflowed.discard(writer)
-        self._next[writer] = max(seq + 1, expected)
-        return missing

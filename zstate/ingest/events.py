@@ -16,7 +16,7 @@ from zstate.errors import InsertRefused, format_duration
 from zstate.ingest.deadline import DeadlineMonitor
 from zstate.ingest.diagnostics import Kind, WriterEvent
 from zstate.ingest.frame_ownership import EdgeSource
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 

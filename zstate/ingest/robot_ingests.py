@@ -14,7 +14,7 @@ from zstate.ingest.joint_parts import PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stream_ingests import StreamIngests
 from zstate.ingest.transforms import StaticTransformIngests, TransformIngest
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.messages import RobotDescription, StaticTransforms

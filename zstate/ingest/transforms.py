@@ -13,11 +13,9 @@ from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import CONTESTED, Admitted, EdgeSource, FrameOwnership
-from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, EdgeNames, full_name
 from zstate.wire.messages import (
-    POSE_BYTES,
     Edges,
     RobotDescription,
     Sample,
@@ -27,7 +25,6 @@ from zstate.wire.messages import (
     covariances_of,
     order_digest,
     poses_from_block,
-    select_edges,
 )
 
 # Limit of the edges in the caches of one writer: it may shuffle its edges from sample to sample.
@@ -323,47 +320,3 @@ class StaticTransformIngests:
     def _ingest(self, key: str, robot: str, writer: str, session: int = 0) -> StaticTransformIngest:
         ingest = StaticTransformIngest(robot, writer, self._ownership, is_model=writer == MODEL_WRITER)
         return self._ingests.setdefault((key, session), ingest)
-
-
-class ModelEdgeFilter:
-    """Removes the edges of known models from messages that name edges; the models define them exactly."""
-
-    def __init__(self) -> None:
-        self._links: dict[str, frozenset[str]] = {}
-        self._rows: dict[tuple[str, Edges], list[int]] = {}
-
-    def set_model(self, robot: str, model: RobotModel) -> None:
-        """Remove the links of ``robot`` from now on."""
-        self._links[robot] = frozenset(f"{robot}/{joint.child}" for joint in model.joints)
-        self._rows.clear()
-
-    def filter_sample(self, robot: str, sample: TransformSample) -> TransformSample | None:
-        """The rest of a sample that names its edges; None if nothing is left."""
-        named = sample.edges or ()
-        rows = self._kept(robot, named)
-        if len(rows) == len(named):
-            return sample if named else None
-        return select_edges(sample, named, rows) if rows else None
-
-    def filter_statics(self, robot: str, statics: StaticTransforms) -> StaticTransforms:
-        """The rest of a message of static edges."""
-        rows = self._kept(robot, statics.edges)
-        edges = tuple(statics.edges[row] for row in rows)
-        return StaticTransforms(statics.session, edges, _rows_of(statics.poses, rows))
-
-    def _kept(self, robot: str, edges: Edges) -> list[int]:
-        rows = self._rows.get((robot, edges))
-        if rows is None:
-            rows = list[int]()
-            for row, (_, child) in enumerate(edges):
-                name = ""  # an invalid name is refused and counted when it is inserted
-                with suppress(InvalidInput):
-                    name = full_name(robot, child)
-                if not any(name in links for links in self._links.values()):
-                    rows.append(row)
-            self._rows[robot, edges] = rows
-        return rows
-
-
-def _rows_of(block: bytes, rows: list[int]) -> bytes:
-    return b"".join(block[row * POSE_BYTES : (row + 1) * POSE_BYTES] for row in rows)

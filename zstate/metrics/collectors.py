@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Protocol
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import ListenerStats
-from zstate.net.presence import connections
+from zstate.net.discovery import connections
 from zstate.nodes.metered_buffer import Histogram, InstrumentedBuffer
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-    from zstate.net.presence import RobotInfo
+    from zstate.net.discovery import RobotInfo
     from zstate.net.session import Session
     from zstate.nodes.sample_publisher import SamplePublisher
 

@@ -117,19 +117,22 @@ class Kinematics:
 class MovingEdges:
     """The edges of a robot that joints move, for publishers: ``forms`` in the order of ``model.joints``.
 
-    Poses come from Pinocchio, or from the closed forms if it cannot be loaded (``engine.reason``). Raises
-    ModelError, which names the joint, if both differ by more than 1e-9. Any thread may call; the workspace
-    is locked, and as large as that of ``Kinematics``.
+    Poses come from Pinocchio, or from the closed forms if it cannot be loaded (``engine.reason``), or if
+    ``pinocchio`` is False. Raises ModelError, which names the joint, if both differ by more than 1e-9. Any
+    thread may call; the workspace is locked, and as large as that of ``Kinematics``.
     """
 
-    def __init__(self, model: RobotModel) -> None:
-        from zstate.model.pinocchio_solver import PinocchioSolver, closed_forms  # noqa: PLC0415 - as above
+    def __init__(self, model: RobotModel, *, pinocchio: bool = True) -> None:
+        from zstate.model.pinocchio_solver import Engine, PinocchioSolver, closed_forms  # noqa: PLC0415 - as above
 
         self._model, self._table = model, JointTransforms(model)
         self._rows = np.flatnonzero([form.kind != "fixed" for form in self._table.forms])
         self.forms = tuple(self._table.forms[row] for row in self._rows)
         self._lock = fork_safe_lock()
         self._solver: PinocchioSolver | None = None
+        self.engine = Engine("closed forms")
+        if not pinocchio:
+            return
         try:
             self._solver = PinocchioSolver(model, self._table.forms)
             self.engine = self._solver.engine

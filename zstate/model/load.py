@@ -19,6 +19,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_document, xacro_elements
 from zstate.model.xacro_expansion import expand_xacro
 from zstate.model.xml import MAX_BYTES, read_document
+from zstate.model.xml_text import decode
 
 __all__ = ["CatalogEntry", "catalog", "is_path", "load_model"]
 
@@ -51,7 +52,7 @@ def load_model(
         else:
             path, label = Path(source), os.fspath(source)
         data = _read(path, label)
-    document = read_document(data, label)
+    document = read_document(decode(data, label) if isinstance(data, bytes) else data, label)
     if xacro_elements(document.root) or (path is not None and path.suffix == ".xacro"):
         urdf, warnings = expand_xacro(document.text, label, path, xacro_args or {})
         model = parse_document(read_document(urdf, f"{label} (expanded)"), f"{label} (expanded)")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from zstate.checks import Floats
 from zstate.errors import LibraryMissing
 from zstate.extension import kernel
-from zstate.model.joint_transforms import JointTransform
+from zstate.model.joint_forms import JointTransform
 from zstate.model.robot import RobotModel
 
 if TYPE_CHECKING or kernel == "c":
@@ -40,7 +40,7 @@ _COMMANDS = {
 class Engine(NamedTuple):
     """What computes a publisher's transforms: "Pinocchio 4.1.0", or "closed forms".
 
-    For closed forms ``reason`` describes why, and ``command`` mends it.
+    For closed forms in place of Pinocchio ``reason`` describes why, and ``command`` mends it.
     """
 
     name: str

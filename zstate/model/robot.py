@@ -34,7 +34,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.format import html_table, suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.checks import QUATERNION_TOLERANCE, real_numbers, reduced_to_fields
 from zstate.errors import FindingLike, InvalidInput
 
@@ -140,6 +140,8 @@ class RobotModel:
     __reduce__ = reduced_to_fields  # without what is cached
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_table  # noqa: PLC0415 - for notebooks alone
+
         headings = ("joint", "type", "parent", "child", "lower", "upper", "velocity", "effort")
         rows = [_shown_cells(joint) for joint in self.driven_joints[:_SHOWN_JOINTS]]
         more = len(self.driven_joints) - len(rows)

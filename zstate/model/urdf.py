@@ -33,7 +33,7 @@ _ROBOT_PARTS = {"link", "joint", "group"}
 _OTHER_GROUPS = {"gazebo", "transmission", "ros2_control"}
 
 
-def parse_urdf(text: str | bytes, source: str) -> RobotModel:
+def parse_urdf(text: str, source: str) -> RobotModel:
     """The robot that URDF ``text`` describes; ``source`` names it in messages.
 
     Raises ModelError with all findings, by line. Warnings alone are kept in ``model.findings``.

@@ -1,4 +1,4 @@
-"""XML reader for untrusted input: bytes to text, to elements with lines, to numbers.
+"""XML reader for untrusted input: text to elements with lines, to numbers.
 
 Limits: 16 MiB, 200,000 elements, 100 levels. Entities are neither declared nor fetched: a DOCTYPE
 with declarations or a reference to a file is refused. Prefixes are kept as written (``xacro:macro``)
@@ -8,7 +8,6 @@ of the locale.
 
 from __future__ import annotations
 
-import codecs
 import math
 import re
 from collections.abc import Iterator
@@ -16,15 +15,6 @@ from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from zstate.model.findings import model_error, quoted
-
-_BYTE_ORDER_MARKS = (
-    (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF16_LE, "utf-16-le"),
-    (codecs.BOM_UTF16_BE, "utf-16-be"),
-)
-# Fixed, because Python has codecs that are no text encodings of files (rot13, unicode_escape).
-_ENCODINGS = {"utf-8", "us-ascii", "ascii", "iso-8859-1", "latin-1", "iso-8859-15", "windows-1252", "cp1252"}
-_DECLARED = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]*)["']""")
 
 MAX_BYTES = 16 * 1024 * 1024
 MAX_ELEMENTS = 200_000
@@ -68,15 +58,16 @@ class Document:
     root: Element
 
 
-def read_document(data: str | bytes, source: str) -> Document:
-    """The element tree of ``data``. Raises ModelError if it is not XML, or not safe to read.
+def check_length(length: int, source: str) -> None:
+    """Raise ModelError for a text that is too long."""
+    if length > MAX_BYTES:
+        raise model_error(source, f"the text has {length} bytes; the limit is {MAX_BYTES}")
 
-    Encodings: UTF-8, UTF-16 with a byte order mark, and, if the XML declaration names them, US-ASCII,
-    ISO-8859-1, ISO-8859-15 and windows-1252.
-    """
-    if len(data) > MAX_BYTES:
-        raise model_error(source, f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
-    text = data.removeprefix("\ufeff") if isinstance(data, str) else _decode(data, source)
+
+def read_document(text: str, source: str) -> Document:
+    """The element tree of ``text``. Raises ModelError if it is not XML, or not safe to read."""
+    check_length(len(text), source)
+    text = text.removeprefix("\ufeff")
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -89,35 +80,6 @@ def read_document(data: str | bytes, source: str) -> Document:
         raise model_error(source, 'the text is empty; a URDF begins with <robot name="...">', fix=whole)
     lines_before = text.count("\n", 0, len(text) - len(body))
     return Document(body, _Reader(source, body, lines_before).read())
-
-
-def _decode(data: bytes, source: str) -> str:
-    mark, encoding = next((one for one in _BYTE_ORDER_MARKS if data.startswith(one[0])), (b"", ""))
-    data = data[len(mark) :]
-    if not encoding:
-        if b"\0" in data:
-            line, column = _place(data, data.index(b"\0"))
-            message = f"column {column}: a zero byte; this is a binary file, not a URDF"
-            raise model_error(source, message, line)
-        declared = _DECLARED.match(data[:1000])
-        encoding = "utf-8" if declared is None else declared[1].decode("latin-1")
-        if encoding.lower() not in _ENCODINGS:
-            message = f"the declared encoding {encoding[:40]!r} is not read; save the file as UTF-8"
-            raise model_error(source, message, 1)
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError as error:
-        line, column = _place(data, error.start)
-        message = (
-            f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file as "
-            'UTF-8, or declare its encoding in line 1 (<?xml version="1.0" encoding="ISO-8859-1"?>)'
-        )
-        raise model_error(source, message, line) from None
-
-
-def _place(data: bytes, offset: int) -> tuple[int, int]:
-    """Line and column of a byte, both counted from 1."""
-    return data.count(b"\n", 0, offset) + 1, offset - data.rfind(b"\n", 0, offset)
 
 
 class _Reader:

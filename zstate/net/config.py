@@ -1,4 +1,4 @@
-"""Session settings: modes, checked endpoints, ``ZSTATE_*`` variables, and the zenoh.Config they make."""
+"""Session settings: modes, checked endpoints, and the zenoh.Config they make."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ import json
 import os
 import re
 import socket
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import zenoh
 
 from zstate._util.endpoint import parse_endpoint, parse_host_port
-from zstate.errors import ConfigError, InvalidInput, NetworkError, PortBusy
+from zstate.errors import ConfigError, InvalidInput
 
 if TYPE_CHECKING:
     from zstate.net.security.credentials import Credentials
@@ -25,6 +23,9 @@ Mode = Literal["peer", "loopback", "lan", "client", "router"]
 ConfigSource: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | zenoh.Config"
 
 CONFIG_VARIABLE = "ZENOH_CONFIG"
+MODE, CONNECT, LISTEN, FILE = "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG"
+"""The variables of the arguments of ``connect``; ``zstate.net.environment`` reads them."""
+
 ANY_LOOPBACK_PORT = "tcp/127.0.0.1:0"
 ROUTER_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -45,32 +46,9 @@ SETTINGS: dict[str, object] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
 }
 
-ROS_ROUTER: dict[str, object] = {
-    "mode": "router",
-    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
-    "routing": {"router": {"peers_failover_brokering": False}},
-    "timestamping": {"enabled": True},
-    # Many nodes start at once, and are busy with that for a while.
-    "queries_default_timeout": 600_000,
-    "transport": {
-        "unicast": {
-            "open_timeout": 60_000,
-            "accept_timeout": 60_000,
-            "accept_pending": 10_000,
-            "max_sessions": 10_000,
-        },
-        "link": {"tx": {"lease": 60_000, "keep_alive": 2}},
-        "shared_memory": {"enabled": False},
-    },
-}
-"""The settings of rmw_zenohd, except that it listens at tcp/[::]:7447, which is open to the network.
 
-ROS nodes are peers. They find each other through the router's gossip and exchange data directly; the router
-forwards between peers and clients.
-"""
-
-_ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
-_LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
+ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
+LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
 
 
 def endpoint_list(endpoints: str | Sequence[str]) -> tuple[str, ...]:
@@ -78,10 +56,10 @@ def endpoint_list(endpoints: str | Sequence[str]) -> tuple[str, ...]:
     checked = (endpoints,) if isinstance(endpoints, str) else tuple(endpoints)
     for endpoint in checked:
         protocol, slash, location = endpoint.partition("/")
-        if not slash or protocol not in _ADDRESSED | _LOCAL:
+        if not slash or protocol not in ADDRESSED | LOCAL:
             raise InvalidInput(f"{endpoint!r} is not an endpoint; {_advice(endpoint)}")
         address = re.split(r"[?#]", location, maxsplit=1)[0]
-        if protocol in _ADDRESSED and parse_endpoint(endpoint) is None:
+        if protocol in ADDRESSED and parse_endpoint(endpoint) is None:
             raise InvalidInput(f"{endpoint!r} has no host and port; {_advice(address, protocol)}")
         if not address:
             raise InvalidInput(f"{endpoint!r} has no address after {protocol + '/'!r}")
@@ -104,7 +82,7 @@ def default_config(
     credentials: Credentials | None = None,
 ) -> zenoh.Config:
     """The default settings. Without ``timeout_s`` connecting is retried for ever and opening never fails."""
-    settings = {**SETTINGS, **_mode_settings(mode), **(credentials.settings() if credentials else {})}
+    settings = {**SETTINGS, **mode_settings(mode), **(credentials.settings() if credentials else {})}
     # A peer found by multicast or gossip may accept plain TCP: with certificates only these are used.
     # Routers search for no peers, and may serve the programs of their host without certificates.
     if mode != "router" and credentials is not None and credentials.ca is not None:
@@ -116,26 +94,8 @@ def default_config(
     return apply_settings(zenoh.Config(), settings)
 
 
-def user_config(
-    source: ConfigSource,
-    mode: Mode,
-    endpoints: Sequence[str],
-    listen: Sequence[str],
-    credentials: Credentials | None = None,
-) -> zenoh.Config:
-    """The user's configuration, with credentials, endpoints and a mode other than "peer" replaced."""
-    settings = {
-        **({} if mode == "peer" else _mode_settings(mode)),
-        **(credentials.settings() if credentials else {}),
-    }
-    if endpoints:
-        settings["connect/endpoints"] = list(endpoints)
-    if listen:
-        settings["listen/endpoints"] = list(listen)
-    return apply_settings(_load(source), settings)
-
-
-def _mode_settings(mode: Mode) -> dict[str, object]:
+def mode_settings(mode: Mode) -> dict[str, object]:
+    """The settings of ``mode``, by path."""
     if mode == "lan":
         return {
             "mode": "peer",
@@ -153,59 +113,9 @@ def apply_settings(config: zenoh.Config, settings: Mapping[str, object]) -> zeno
     return config
 
 
-def endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
-    """The endpoints that ``config`` connects to; empty unless they are a plain list."""
-    found = json.loads(config.get_json("connect/endpoints"))
-    return tuple(e for e in found if isinstance(e, str)) if isinstance(found, list) else ()  # pyright: ignore[reportUnknownVariableType]
-
-
-def credentials_in(config: zenoh.Config) -> Credentials | None:
-    """The credentials in ``config``; None if it has none, or of a kind that ``connect`` does not accept."""
-    tls: dict[str, Any] = json.loads(config.get_json("transport/link/tls"))
-    user: dict[str, Any] = json.loads(config.get_json("transport/auth/usrpwd"))
-    found = {
-        "user": user["user"],
-        "password": user["password"],
-        "ca": tls["root_ca_certificate"],
-        "certificate": tls["connect_certificate"],
-        "key": tls["connect_private_key"],
-    }
-    if not any(found.values()):
-        return None
-    from zstate.net.security.credentials import Credentials  # noqa: PLC0415  # most sessions have none
-
-    try:
-        return Credentials(**found)
-    except ConfigError:
-        return None
-
-
 def scouts_by_multicast(config: zenoh.Config) -> bool:
     """Whether a session with ``config`` searches for others by multicast, in whatever mode."""
     return json.loads(config.get_json("scouting/multicast/enabled")) is True
-
-
-def _load(source: ConfigSource) -> zenoh.Config:
-    if isinstance(source, zenoh.Config):
-        return zenoh.Config.from_json5(str(source))
-    if isinstance(source, Mapping):
-        return _parse(json.dumps(dict(source)), "the configuration given")
-    path = Path(source)
-    if (text := str(path)).partition("/")[0] in _ADDRESSED | _LOCAL and not path.exists():
-        error = f"{text!r} is an endpoint, not a file: connect(mode='client', endpoints={text!r})"
-        raise ConfigError(error, path=text)
-    try:
-        return _parse(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        text = f"the Zenoh configuration {str(path)!r} cannot be read: {error}"
-        raise ConfigError(text, path=str(path)) from None
-
-
-def _parse(text: str, name: str) -> zenoh.Config:
-    try:
-        return zenoh.Config.from_json5(text)
-    except zenoh.ZError as error:
-        raise ConfigError(f"{name!r} is not a Zenoh configuration: {error}", path=name) from None
 
 
 def check_mode(mode: str) -> Mode:
@@ -258,95 +168,3 @@ def check_credentials(mode: Mode, credentials: Credentials | None, listen: Itera
             "of user:password lines",
             path="users",
         )
-
-
-MODE, CONNECT, LISTEN, FILE = "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG"
-CERTS, IDENTITY = "ZSTATE_CERTS", "ZSTATE_IDENTITY"
-USER, PASSWORD, PASSWORD_FILE = "ZSTATE_USER", "ZSTATE_PASSWORD", "ZSTATE_PASSWORD_FILE"
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class SessionSettings:
-    """The arguments of ``connect``."""
-
-    mode: Mode
-    endpoints: tuple[str, ...]
-    listen: tuple[str, ...]
-    config: str | None
-    credentials: Credentials | None
-
-
-def settings_from_environment() -> SessionSettings | None:
-    """The settings in ZSTATE_MODE, _CONNECT, _LISTEN and _CONFIG, with credentials; None if all are unset.
-
-    Endpoints are separated by blanks. Raises ConfigError with the variable.
-    """
-    mode, config = os.environ.get(MODE), os.environ.get(FILE) or None
-    endpoints, listen = _endpoints(CONNECT), _endpoints(LISTEN)
-    if not (mode or endpoints or listen or config):
-        return None
-    checked: Mode = _checked(MODE, lambda: check_mode(mode or implied_mode(endpoints, listen, config)))
-    if checked == "loopback":
-        for variable, used in ((CONNECT, endpoints), (LISTEN, listen)):
-            _checked(variable, lambda used=used: check_loopback_only(used))
-    if checked == "client" and not (endpoints or config or os.environ.get(CONFIG_VARIABLE)):
-        raise ConfigError(
-            f"{MODE} is 'client' and {CONNECT} is not set; set it to the router's endpoint, for instance "
-            "tcp/192.168.1.10:7447",
-            path=MODE,
-        )
-    return SessionSettings(checked, endpoints, listen, config, _credentials_in_environment())
-
-
-def implied_mode(endpoints: object, listen: object, config: object) -> str:
-    """The mode if endpoints are set, but no mode."""
-    # An endpoint to connect to is usually a router, and peers do not forward.
-    return "client" if endpoints and not listen and not config else "peer"
-
-
-@contextmanager
-def blame_variable() -> Generator[None]:
-    """Add the variable that holds the endpoint to network errors."""
-    try:
-        yield
-    except NetworkError as error:
-        variable = LISTEN if isinstance(error, PortBusy) else CONNECT
-        if os.environ.get(variable):
-            error.args = (f"{error} (the endpoint is from {variable} in the environment)",)
-        raise
-
-
-def _endpoints(variable: str) -> tuple[str, ...]:
-    return _checked(variable, lambda: endpoint_list(os.environ.get(variable, "").split()))
-
-
-def _checked(variable: str, check: Callable[[], T]) -> T:
-    try:
-        return check()
-    except InvalidInput as error:
-        raise ConfigError(f"{variable} in the environment: {error}", path=variable) from None
-
-
-def _credentials_in_environment() -> Credentials | None:
-    certs, identity, user = (os.environ.get(variable) for variable in (CERTS, IDENTITY, USER))
-    if bool(certs) != bool(identity):
-        has, lacks = (CERTS, IDENTITY) if certs else (IDENTITY, CERTS)
-        raise ConfigError(f"{has} is set but {lacks} is not; set both or neither", path=has)
-    if not (certs or user):
-        return None
-    from zstate.net.security.credentials import Credentials, password_in  # noqa: PLC0415  # as above
-
-    password = os.environ.get(PASSWORD) if user else None
-    if user and (file := os.environ.get(PASSWORD_FILE)):
-        password = password_in(file)
-    elif user and not password:
-        raise ConfigError(
-            f"the password of {user!r} ({USER} in the environment) is missing; put it into {PASSWORD}, or "
-            f"the path of its file into {PASSWORD_FILE}",
-            path=PASSWORD,
-        )
-    if certs and identity:
-        return Credentials.from_folder(certs, identity, user=user or None, password=password)
-    return Credentials(user=user, password=password)

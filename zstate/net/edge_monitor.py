@@ -17,17 +17,11 @@ import zenoh
 
 from zstate._util.closeable import Closeable
 from zstate.errors import MessageError
-from zstate.net.ownership import (
-    CHECK_PERIOD_S,
-    Edge,
-    frame_conflict,
-    moving_streams,
-    named_edges,
-    seniority,
-)
+from zstate.net.edge_ownership import Edge, frame_conflict, named_edges
+from zstate.net.ownership import CHECK_PERIOD_S, moving_streams, seniority
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, Ring, to_serialized
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import SAMPLE_BYTES
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import WRITER_TOKEN, stream_key

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError, Unreachable
-from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
+from zstate.net.discovery import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
 from zstate.net.sites import NO_SITES, Sites, Thinning
 from zstate.net.status_monitor import StatusMonitor, WriterState
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER

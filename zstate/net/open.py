@@ -5,21 +5,17 @@ Also sets Zenoh's thread-pool sizes: enough that closing dead links does not blo
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import os
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import zenoh
 
 from zstate.errors import AccessDenied, NetworkError, PortBusy
 from zstate.net.at_exit import session_opening
-from zstate.net.config import endpoints_in
 
 if TYPE_CHECKING:
     from zstate.net.security.credentials import Credentials
@@ -33,6 +29,10 @@ CHECK_PERIOD_S = 1.0
 # Of Zenoh's runtimes the sockets belong to "net" and "acc", and what receives from them to "rx": each sample
 # wakes a thread to wake another. With one runtime for the three, a reader's sample costs 30 us less CPU.
 #
+# A router sends what it receives in the thread that received it, which waits while the queue of a neighbour
+# is full: up to 50 ms for each cloud. With one runtime that may be the thread that polls all sockets, so a
+# router has another one for "rx": next to clouds the p99 of joint states was 2.6 ms, and is 0.6.
+#
 # zenoh 1.10, closing the socket of a neighbour that was cut off blocks a thread for the 10 s of SO_LINGER,
 # issue 1101: delete when fixed. With all threads blocked nothing can connect, so there are more threads than
 # one. "tx" closes nothing and keeps its single one: a second is woken in vain.
@@ -42,8 +42,10 @@ _ROUTER_THREADS = 128
 
 def runtime(*, is_router: bool) -> str:
     """The value for ``ZENOH_RUNTIME``."""
-    threads = _ROUTER_THREADS if is_router else _THREADS
-    return f"(rx: (handover: net), acc: (handover: net), net: (worker_threads: {threads}))"
+    if is_router:
+        pool = f"(worker_threads: {_ROUTER_THREADS})"
+        return f"(rx: {pool}, acc: (handover: net), net: {pool})"
+    return f"(rx: (handover: net), acc: (handover: net), net: (worker_threads: {_THREADS}))"
 
 
 def open_zenoh(config: zenoh.Config) -> zenoh.Session:
@@ -107,43 +109,3 @@ def _attempt(config: zenoh.Config) -> zenoh.Session | None:
         text = re.sub(r" at /[^\s\]]*", "", text)  # places in Zenoh's sources
         raise NetworkError(f"Zenoh cannot open a session: {text}")
     return None
-
-
-# zenoh 1.10, a client spends all of connect/timeout_ms on its first endpoint, issue 1602: delete when fixed
-def connect_timeout(config: zenoh.Config) -> float:
-    """How long the client that ``config`` describes retries [s]; clears that time in ``config``.
-
-    Without it, Zenoh tries each endpoint once. 0 if ``config`` describes no client, or does not retry.
-    """
-
-    def client_value(name: str) -> Any:
-        """A setting, or the client's part of it if it has a value for each mode."""
-        value: Any = json.loads(config.get_json(f"connect/{name}"))
-        return cast("dict[str, Any]", value).get("client") if isinstance(value, dict) else value
-
-    timeout_ms, is_needed = client_value("timeout_ms"), client_value("exit_on_failure")
-    is_client = json.loads(config.get_json("mode")) == "client"
-    if not (is_client and endpoints_in(config) and timeout_ms) or is_needed is False:
-        return 0.0
-    config.insert_json5("connect/timeout_ms", "0")
-    return math.inf if timeout_ms < 0 else timeout_ms / 1000.0
-
-
-@dataclass(frozen=True, slots=True)
-class ProbeSession:
-    """Configuration of a second client with the same ``identity``, which checks what a router forwards."""
-
-    config: zenoh.Config
-    identity: str
-
-    @classmethod
-    def for_config(cls, config: zenoh.Config, credentials: Credentials | None) -> ProbeSession | None:
-        """For the session that ``config`` opened; None unless it is a client with an identity."""
-        if credentials is None or not credentials.identity or json.loads(config.get_json("mode")) != "client":
-            return None
-        config.insert_json5("connect/timeout_ms", "0")  # each endpoint once
-        return cls(config, credentials.identity)
-
-    def open(self) -> zenoh.Session:
-        """Open it. Raises zenoh.ZError if no router answers."""
-        return open_zenoh(self.config)

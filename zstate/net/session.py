@@ -19,27 +19,27 @@ from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
 from zstate.net.at_exit import close_at_exit, end_sessions, forked_text, join_at_exit, leak, session_opening
 from zstate.net.config import (
     CONFIG_VARIABLE,
+    CONNECT,
+    FILE,
+    LISTEN,
+    MODE,
     ConfigSource,
     Mode,
-    blame_variable,
     check_credentials,
     check_loopback_only,
     check_mode,
-    credentials_in,
     default_config,
     endpoint_list,
-    endpoints_in,
     listen_endpoints,
     scouts_by_multicast,
-    settings_from_environment,
-    user_config,
 )
-from zstate.net.open import ProbeSession, connect_timeout, open_with_retry
+from zstate.net.open import open_with_retry
 
 if TYPE_CHECKING:
     from zstate.net.connection_monitor import ConnectionMonitor
     from zstate.net.rendezvous import Rendezvous
     from zstate.net.security.credentials import Credentials
+    from zstate.net.security.probe import ProbeSession
 
 CLOSE_TIMEOUT_S = 0.8
 _UNDECLARE_TIMEOUT_S = 0.5
@@ -94,7 +94,10 @@ def connect(
     answers and AccessDenied if all that answer deny it; PortBusy, NetworkError. The other modes retry; a
     denial and its reason are logged as a warning.
     """
-    if config is None and mode is None and not endpoints and not listen:
+    is_in_environment = any(os.environ.get(name) for name in (MODE, CONNECT, LISTEN, FILE))
+    if is_in_environment and config is None and mode is None and not endpoints and not listen:
+        from zstate.net.environment import blame_variable, settings_from_environment  # noqa: PLC0415 - as below
+
         settings = settings_from_environment()
         if settings is not None:
             with blame_variable():
@@ -124,9 +127,12 @@ def connect(
                 f"configuration ({CONFIG_VARIABLE} names one, too), or the mode",
                 path="mode",
             )
-        user = user_config(source, checked, endpoints, listen, credentials)
-        endpoints = endpoints or endpoints_in(user)
-        return _session(user, endpoints, credentials or credentials_in(user), connect_timeout(user))
+        from zstate.net import user_config as given  # noqa: PLC0415 - most sessions have the default settings
+
+        user = given.user_config(source, checked, endpoints, listen, credentials)
+        endpoints = endpoints or given.endpoints_in(user)
+        credentials = credentials or given.credentials_in(user)
+        return _session(user, endpoints, credentials, given.connect_timeout(user))
 
 
 def _connect(
@@ -152,7 +158,12 @@ def _session(
 ) -> Session:
     raw = open_with_retry(config, endpoints, credentials, timeout_s)
     monitor = _connection_monitor(raw, config, endpoints, credentials)
-    return Session(raw, monitor, probe=ProbeSession.for_config(config, credentials))
+    probe = None
+    if credentials is not None:
+        from zstate.net.security.probe import ProbeSession  # noqa: PLC0415 - as above
+
+        probe = ProbeSession.for_config(config, credentials)
+    return Session(raw, monitor, probe=probe)
 
 
 def _connection_monitor(

@@ -19,7 +19,7 @@ from zstate.net.presence import CAPACITY, announce, confirmed_tokens
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.net.streams import Receiver
-from zstate.plugins import find_stream
+from zstate.stream_registry import find_stream
 from zstate.streams import StreamName
 from zstate.wire.keys import SITE_TOKEN
 

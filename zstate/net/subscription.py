@@ -9,7 +9,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.plugins import is_bulk, is_latched
+from zstate.stream_registry import is_bulk, is_latched
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY, shortened
 from zstate.wire.messages import Message

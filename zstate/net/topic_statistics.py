@@ -25,7 +25,7 @@ from zstate.net.status import PERIOD_S
 from zstate.net.status_monitor import StatusSubscriber
 from zstate.net.streams import StreamSubscriber
 from zstate.net.subscription import decode_samples
-from zstate.plugins import is_bulk
+from zstate.stream_registry import is_bulk
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY
 from zstate.wire.messages import StampedMessage, Status

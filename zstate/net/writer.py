@@ -1,7 +1,4 @@
-"""Writers of one robot on one wire: publishers that own their encoder, announced by liveliness tokens.
-
-``check_may_write`` detects writes that the access control of a router drops.
-"""
+"""Writers of one robot on one wire: publishers that own their encoder, announced by liveliness tokens."""
 
 from __future__ import annotations
 
@@ -10,16 +7,13 @@ from collections.abc import Generator, Iterable
 from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, TypeVar
 
-import zenoh
-
 from zstate._util.closeable import Closeable
-from zstate.errors import AccessDenied, Closed
+from zstate.errors import Closed
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
-from zstate.net.queryable import query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
-from zstate.plugins import is_bulk, stream_named
+from zstate.stream_registry import is_bulk, stream_named
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
@@ -29,8 +23,6 @@ from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
 if TYPE_CHECKING:
     from zstate._kernel import PublishPath
 
-_PERMISSION_TIMEOUT_S = 1.0
-_PERMISSION_ROUND_S = 0.02
 
 W = TypeVar("W", "SampleWriter", "LatchedWriter")
 
@@ -153,7 +145,9 @@ class WireWriter(Closeable):
 
     def _announce(self, token: str) -> None:
         self._opened.enter_context(announce(self._session, token))
-        if not self._is_permitted:
+        if not self._is_permitted and self._session.probe is not None:
+            from zstate.net.security.write_permission import check_may_write  # noqa: PLC0415 - see there
+
             # One check is enough: all streams of a robot have the same permissions.
             check_may_write(self._session, self._node.robot, token)
             self._is_permitted = True
@@ -161,52 +155,3 @@ class WireWriter(Closeable):
     def close(self) -> None:
         """Close all streams and withdraw their tokens. A second call does nothing."""
         self._opened.close()
-
-
-def check_may_write(session: Session, robot: str, token: str) -> None:
-    """Raise AccessDenied if the router of ``session`` drops what it writes of ``robot``.
-
-    Zenoh gives no error for that. ``token`` is a liveliness token that the session keeps among the robot's
-    keys. A second session of the same identity, open for milliseconds, queries the router for it. Without
-    credentials, in modes other than client, and while the router changes, nothing is checked.
-    """
-    probe = session.probe
-    if probe is None or not _routers(session.zenoh):
-        return
-    try:
-        other = probe.open()
-    except zenoh.ZError:
-        return
-    with other:
-        if _routers(other) != _routers(session.zenoh):
-            return
-        deadline = time.monotonic() + _PERMISSION_TIMEOUT_S
-        while time.monotonic() < deadline:
-            if query_tokens(other, token, _PERMISSION_TIMEOUT_S).keys:
-                return
-            time.sleep(_PERMISSION_ROUND_S)
-    raise AccessDenied(
-        f"the router does not let {probe.identity} write as robot {robot!r}: it drops {token!r}, and would "
-        f"drop samples without an error. {_advice(robot, token)}; "
-        "routers read it when they start",
-        reason="not allowed to write",
-        endpoint=token,
-    )
-
-
-def _advice(robot: str, token: str) -> str:
-    """What lets an identity write what ``token`` announces."""
-    if "joint_commands" in token:
-        return (
-            "Only commanders command a robot and release its stops: `zstate acl --robot "
-            f"{robot} --commander NAME` prints the rules for the identity NAME"
-        )
-    return (
-        "Is this the identity of that robot? If so, the access control of the router lacks the rules "
-        f"'{robot} writes' and '{robot} reads', which `zstate acl --robot {robot}` prints, with --wire for "
-        "those of ROS"
-    )
-
-
-def _routers(session: zenoh.Session) -> set[str]:
-    return {str(zid) for zid in session.info.routers_zid()}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from zstate._util.closeable import Closeable
 from zstate._util.format import did_you_mean
+from zstate._util.tf2_methods import missing_method
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer, feed_of
 from zstate.clock import Clock
 from zstate.errors import InvalidInput
@@ -132,8 +133,6 @@ class TransformListener(Closeable):
     if not TYPE_CHECKING:  # type checkers report such names themselves
 
         def __getattr__(self, name: str) -> NoReturn:
-            from zstate._util.other_names import missing_method  # noqa: PLC0415 - for mistakes alone
-
             raise missing_method(self, name, self.__dict__.get("buffer"))
 
     def lookup(

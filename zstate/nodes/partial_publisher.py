@@ -12,7 +12,7 @@ from zstate.errors import SecondWriter
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.net.edge_monitor import EdgeMonitor
-from zstate.net.ownership import claim_edges
+from zstate.net.edge_ownership import claim_edges
 from zstate.net.session import Session
 from zstate.nodes.publisher import Positions, positions_block
 from zstate.nodes.publisher_status import LimitWatch

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.format import html_of_fields
 from zstate.errors import InvalidInput, format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
@@ -62,6 +61,8 @@ class PublisherStats:
     warning: str = ""
 
     def _repr_html_(self) -> str:
+        from zstate._util.html import html_of_fields  # noqa: PLC0415 - for notebooks alone
+
         return html_of_fields(self)
 
 

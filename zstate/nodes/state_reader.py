@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
@@ -20,18 +20,21 @@ from zstate.ingest.diagnostics import Diagnostics
 from zstate.ingest.robot_ingests import Follow, RobotIngests
 from zstate.ingest.stream_ingests import StreamIngests
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import OtherTfSubscription, WriterWatch, announce_reader
+from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.requests import Requests
 from zstate.net.sample_history import MAX_IN_FLIGHT, HistoryRequest
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.plugins import is_named
+from zstate.stream_registry import is_named
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, shortened, stream_from_key, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample, Wire
+
+if TYPE_CHECKING:
+    from zstate.net.other_tf import OtherTfSubscription
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -124,6 +127,8 @@ class StateReader(Closeable):
         opening.enter_context(self._subscriber(self._follow))
         others = [stream for stream in self.ingests.streams if stream != self._follow]
         if others and self._wire.shared:
+            from zstate.net.other_tf import OtherTfSubscription  # noqa: PLC0415 - on ROS wires alone
+
             subscribe = partial(self._subscriber, self._wire.transforms)
             return opening.enter_context(OtherTfSubscription(subscribe))
         for stream in others:

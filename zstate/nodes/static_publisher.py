@@ -12,7 +12,7 @@ from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import check_names
 from zstate.errors import InvalidInput
-from zstate.net.ownership import check_readers, claim_edges
+from zstate.net.edge_ownership import check_readers, claim_edges
 from zstate.net.session import Session
 from zstate.net.writer import write_all
 from zstate.nodes.robot_writer import RobotWriter

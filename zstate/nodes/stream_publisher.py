@@ -8,10 +8,10 @@ from typing import Any
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
-from zstate.nodes.sample_publisher import MeasurementPublisher
-from zstate.plugins import find_stream, stream_named
+from zstate.nodes.measurement_publisher import MeasurementPublisher
+from zstate.stream_registry import find_stream, stream_named
 from zstate.streams import Stream
-from zstate.wire.native import new_message
+from zstate.wire.measurements import new_message
 
 
 class StreamPublisher(MeasurementPublisher):

@@ -16,7 +16,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.edge_monitor import EdgeMonitor
-from zstate.net.ownership import Edge, check_readers, claim_edges
+from zstate.net.edge_ownership import Edge, check_readers, claim_edges
 from zstate.net.session import Session
 from zstate.nodes.sample_publisher import SamplePublisher
 from zstate.rate import RateReport

@@ -19,7 +19,8 @@ from zstate.odometry.messages import (
     Velocity,
 )
 from zstate.wire.keys import full_name
-from zstate.wire.messages import covariance_matrix, from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import from_block
 
 
 def imu_document(message: Imu, robot: str) -> dict[str, Any]:

@@ -11,16 +11,15 @@ from zstate.errors import InvalidInput
 from zstate.message import StampedMessage
 from zstate.odometry.geodesy import Datum, check_geodetic
 from zstate.wire.keys import full_name
-from zstate.wire.messages import (
-    WriterTransforms,
+from zstate.wire.measurements import (
     check_covariance,
     check_finite,
     check_frame,
     check_limit,
     check_quaternion,
     finite_numbers,
-    order_digest,
 )
+from zstate.wire.messages import WriterTransforms, order_digest
 
 
 class Odometry(WriterTransforms, frozen=True, array_like=True, gc=False):

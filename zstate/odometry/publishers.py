@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 
 from zstate.checks import real_numbers
 from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.covariance import check_covariance
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.net.writer import write_all
+from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.nodes.robot_writer import RobotWriter
-from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.nodes.transform_publisher import EdgePublisher, covariance_block
 from zstate.odometry.geodesy import Datum
@@ -29,7 +30,7 @@ from zstate.odometry.messages import (
     Velocity,
 )
 from zstate.streams import StreamName
-from zstate.transform import UPPER_TRIANGLE, Transform, check_covariance
+from zstate.transform import UPPER_TRIANGLE, Transform
 from zstate.wire.keys import check_writer, full_name
 from zstate.wire.messages import to_block
 

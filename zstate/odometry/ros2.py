@@ -16,7 +16,8 @@ import numpy as np
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.odometry.messages import Fix, Imu, MagneticField, Odometry, Pose, Pressure, Velocity
-from zstate.wire.messages import covariance_matrix, from_block, order_digest, to_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import from_block, order_digest, to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.streams import RosStream

@@ -35,7 +35,8 @@ from zstate.odometry.source_noise import (
 from zstate.streams import StreamName
 from zstate.transform import Transform
 from zstate.wire.keys import check_writer
-from zstate.wire.messages import covariance_matrix, from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import from_block
 
 
 class Estimators(NamedTuple):

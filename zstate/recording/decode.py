@@ -14,21 +14,21 @@ from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import edge_streams, is_value, stream_named, streams_where
-from zstate.recording.covariances import CovarianceJoin, child_frame, decode_covariance, is_covariance_topic
+from zstate.recording.covariances import (
+    CovarianceJoin,
+    EdgeCovariance,
+    child_frame,
+    decode_covariance,
+    is_covariance_topic,
+)
 from zstate.recording.encode import NUMBER, POSED_FRAME, TOPICS, StaticAccumulator
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import EDGE_WRITER, JSON, ROBOT, STREAM, VERSION, Channel, Record
+from zstate.stream_registry import edge_streams, is_value, stream_named, streams_where
 from zstate.streams import StreamName
 from zstate.wire.json_form import JsonDecoder, carried_as_json
-from zstate.wire.messages import (
-    JointState,
-    Message,
-    RobotDescription,
-    StaticTransforms,
-    TransformSample,
-    with_field,
-)
+from zstate.wire.measurements import with_field
+from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.streams import (
@@ -239,28 +239,21 @@ class DecodedRecording:
         end: int | None = None,
     ) -> Iterator[DecodedMessage]:
         """The messages of ``writers_of(robots)`` on ``streams``, by log time in [begin, end)."""
-        joins: defaultdict[RecordedWriter, CovarianceJoin] = defaultdict(CovarianceJoin)
+        joined = JoinedMessages(self)
         for undecoded in self.records(robots, streams, begin, end):
-            writer = undecoded.channel.writer
-            if undecoded.channel.covariances_of:
-                self._add_covariance(undecoded, joins[writer])
-                continue
-            for decoded in self.decode(undecoded):
-                if joins and writer in joins and isinstance(decoded.message, TransformSample):
-                    yield decoded._replace(message=joins[writer].join(decoded.message))
-                else:
-                    yield decoded
+            yield from joined.add(undecoded)
 
-    def _add_covariance(self, undecoded: UndecodedRecord, join: CovarianceJoin) -> None:
+    def covariance(self, undecoded: UndecodedRecord) -> EdgeCovariance | None:
+        """The covariance in a record of some; None if it cannot be decoded."""
         channel, record, _ = undecoded
         try:
             covariance = decode_covariance(record.payload, channel.covariances_of)
         except MessageError as error:
             self._refuse(error.reason, f"{record.topic}: {error}")
-            return
+            return None
         to_zstate = channel.names.to_zstate
         parent, child = to_zstate(covariance.parent), to_zstate(covariance.child)
-        join.add(covariance._replace(parent=parent, child=child))
+        return covariance._replace(parent=parent, child=child)
 
     def decode(self, undecoded: UndecodedRecord) -> Iterator[DecodedMessage]:
         """The messages of one record; none if it cannot be decoded."""
@@ -336,6 +329,27 @@ class DecodedRecording:
                 )
             self._known[channel] = decoder
         return self._known[channel]
+
+
+class JoinedMessages:
+    """The messages of records in the order of the recording, transforms with their covariances."""
+
+    def __init__(self, recording: DecodedRecording) -> None:
+        self._recording = recording
+        self._joins: defaultdict[RecordedWriter, CovarianceJoin] = defaultdict(CovarianceJoin)
+
+    def add(self, undecoded: UndecodedRecord) -> Iterator[DecodedMessage]:
+        """The messages of the next record."""
+        writer, joins = undecoded.channel.writer, self._joins
+        if undecoded.channel.covariances_of:
+            if (covariance := self._recording.covariance(undecoded)) is not None:
+                joins[writer].add(covariance)
+            return
+        for decoded in self._recording.decode(undecoded):
+            if joins and writer in joins and isinstance(decoded.message, TransformSample):
+                yield decoded._replace(message=joins[writer].join(decoded.message))
+            else:
+                yield decoded
 
 
 class ChannelDecoder(NamedTuple):

@@ -18,7 +18,6 @@ from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import is_latched, is_value, own_streams, stream_named
 from zstate.recording.covariances import (
     CHILD_FRAME,
     EdgeCovariance,
@@ -29,6 +28,7 @@ from zstate.recording.covariances import (
 )
 from zstate.recording.mcap.writer import ChannelId
 from zstate.recording.storage import EDGE_WRITER, ROBOT, STREAM, VERSION, ChannelType
+from zstate.stream_registry import is_latched, is_value, own_streams, stream_named
 from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.json_form import carried_as_json, encode_json, json_type

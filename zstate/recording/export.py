@@ -35,8 +35,9 @@ from numpy.typing import NDArray
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer, feed_of
-from zstate.errors import InvalidInput, LibraryMissing, LookupFailed, RecordingError
+from zstate.errors import InvalidInput, LibraryMissing, LookupFailed
 from zstate.model.joint_history import JointHistory
+from zstate.recording.errors import RecordingError
 from zstate.recording.joint_states import DELAYED_NS, JointStateBatch
 from zstate.recording.recording import HISTORY_S, Recording
 from zstate.wire.keys import frame_owner

@@ -12,12 +12,12 @@ from typing import Any
 from zstate.errors import MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.plugins import is_latched
 from zstate.recording.decode import RecordedWriter, recorded_writers
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
+from zstate.stream_registry import is_latched
 from zstate.streams import StreamName
-from zstate.wire.messages import from_float32_block
+from zstate.wire.measurements import from_float32_block
 from zstate.wire.ros2.cdr import decode_string
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.options import Ros2Options

@@ -21,11 +21,11 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_parts import JointNames, PartialJointStateIngest, RobotParts
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedRecording, RecordedWriter
 from zstate.recording.joint_states import DELAYED_NS, JointStateBatch
+from zstate.recording.model_edges import ModelEdgeFilter
 from zstate.streams import JOINT_STREAMS
 from zstate.wire.messages import JointState, RobotDescription, Sample
 

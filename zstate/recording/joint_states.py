@@ -6,8 +6,9 @@ decoded together, in a fraction of the time; the samples kept are the same, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,6 +104,11 @@ class RecordedJointReader:
         names = self._first_names() if self._model is None else ()
         self._layout = JointLayout(names) if self._model is None else JointLayout.of_model(self._model)
         self._epoch = _Epoch()
+        self._records: list[UndecodedRecord] = []
+        """Of one channel and length, to decode together."""
+        self._description = b""
+        self._is_new = self._restarts = False
+        self._pending: JointHistory | None = None
 
     @property
     def model(self) -> RobotModel | None:
@@ -136,31 +142,63 @@ class RecordedJointReader:
 
         A sample is passed on once another is 10 s newer. If two samples have one stamp, the later one counts.
         """
-        pending: JointHistory | None = None
-        restarts = False
-        for trajectory, is_new in self._as_recorded():
-            pending = concatenate((trajectory,) if pending is None or is_new else (pending, trajectory))
-            restarts |= is_new
-            settled = np.count_nonzero(pending.stamps < pending.stamps[-1] - DELAYED_NS)
-            if settled:
-                yield JointStateBatch(pending.select(slice(settled)), restarts)
-                pending, restarts = pending.select(slice(settled, None)), False
-        if pending is not None:
-            yield JointStateBatch(pending, restarts)
+        for undecoded in self._recording.records((self.robot,), ("joint_states", "robot_description")):
+            yield from self.add(undecoded)
+        yield from self.finish()
 
-    def _as_recorded(self) -> Iterator[JointStateBatch]:
+    def add(self, undecoded: UndecodedRecord) -> Iterable[JointStateBatch]:
+        """The next record of joint states or of a description, and the batches that ``batches`` has then.
+
+        For callers that read the recording themselves; call ``finish`` after the last one.
+        """
+        records = self._records
+        if undecoded.channel.writer.stream == "robot_description":
+            if undecoded.record.payload == self._description:
+                return ()  # it is written again every 10 s
+            self._description, self._records = undecoded.record.payload, []
+            return self._settled(chain(self._decode(records), self._described(undecoded)))
+        if records and (len(records) == _ROWS or not _is_alike(undecoded, records[0])):
+            self._records = [undecoded]
+            return self._settled(self._decode(records))
+        records.append(undecoded)
+        return ()
+
+    def flush(self) -> Iterator[JointStateBatch]:
+        """The batches of what was added, whose records are not kept any longer."""
+        records, self._records = self._records, []
+        return self._settled(self._decode(records))
+
+    def finish(self) -> Iterator[JointStateBatch]:
+        """The last batches."""
+        yield from self.flush()
+        if self._pending is not None:
+            yield JointStateBatch(self._pending, self._restarts)
+            self._pending = None
+
+    def _settled(self, found: Iterable[_Batch | RobotDescription]) -> Iterator[JointStateBatch]:
+        """The next samples that are older than 10 s."""
+        for trajectory, is_new in self._as_recorded(found):
+            before = self._pending
+            pending = concatenate((trajectory,) if before is None or is_new else (before, trajectory))
+            self._restarts |= is_new
+            settled = np.count_nonzero(pending.stamps < pending.stamps[-1] - DELAYED_NS)
+            self._pending = pending.select(slice(settled, None)) if settled else pending
+            if settled:
+                restarts, self._restarts = self._restarts, False
+                yield JointStateBatch(pending.select(slice(settled)), restarts)
+
+    def _as_recorded(self, found: Iterable[_Batch | RobotDescription]) -> Iterator[JointStateBatch]:
         """The samples that a buffer keeps, as they were recorded: stamps may go back."""
-        is_new = False
-        for batch in self._batches():
+        for batch in found:
             if isinstance(batch, RobotDescription):
-                is_new |= self._replace_model(batch)
+                self._is_new |= self._replace_model(batch)
                 continue
             trajectory, usable = self._layout.read(batch.states, self.robot, self._refuse)
             kept, restarts = self._epoch.keep(batch.session, trajectory.stamps, batch.seqs[usable])
-            is_new |= restarts
+            self._is_new |= restarts
             if len(kept):
+                is_new, self._is_new = self._is_new, False
                 yield JointStateBatch(trajectory.select(kept), is_new)
-                is_new = False
 
     def _replace_model(self, description: RobotDescription) -> bool:
         """Use the model of ``description`` from now on; False if it is the same, or cannot be used."""
@@ -174,26 +212,9 @@ class RecordedJointReader:
         self._layout = JointLayout.of_model(self._model)
         return True
 
-    def _batches(self) -> Iterator[_Batch | RobotDescription]:
-        """The joint states, and the descriptions that differ from the one before, as recorded."""
-        records: list[UndecodedRecord] = []
-        description = b""
-        for undecoded in self._recording.records((self.robot,), ("joint_states", "robot_description")):
-            channel, record, _ = undecoded
-            if channel.writer.stream == "robot_description":
-                if record.payload == description:
-                    continue  # it is written again every 10 s
-                description = record.payload
-                yield from self._decode(records)
-                records = []
-                messages = (decoded.message for decoded in self._recording.decode(undecoded))
-                yield from (message for message in messages if isinstance(message, RobotDescription))
-                continue
-            if records and (len(records) == _ROWS or not _is_alike(undecoded, records[0])):
-                yield from self._decode(records)
-                records = []
-            records.append(undecoded)
-        yield from self._decode(records)
+    def _described(self, undecoded: UndecodedRecord) -> Iterator[RobotDescription]:
+        messages = (decoded.message for decoded in self._recording.decode(undecoded))
+        return (message for message in messages if isinstance(message, RobotDescription))
 
     def _decode(self, records: Sequence[UndecodedRecord]) -> Iterator[_Batch]:
         """The joint states of records of one channel and length: together, or else one by one."""

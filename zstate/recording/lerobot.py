@@ -34,7 +34,8 @@ from numpy.typing import NDArray
 from zstate._util.format import SECOND_NS
 from zstate._util.refusals import Refusals
 from zstate.clock import format_stamp
-from zstate.errors import InvalidInput, MessageError, RecordingError
+from zstate.errors import InvalidInput, MessageError
+from zstate.recording.errors import RecordingError
 from zstate.recording.export import arrow
 from zstate.recording.recording import Recording
 

@@ -15,21 +15,23 @@ from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.joint_parts import JointNames, joint_order
-from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.edge_monitor import EdgeMonitor
-from zstate.net.ownership import Edge, WriterClaim, claim_edges, named_edges
+from zstate.net.edge_ownership import Edge, claim_edges, named_edges
+from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
-from zstate.plugins import edge_streams, is_bulk, is_latched, is_measured, is_named, measured_streams
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, edges_with_more, static_key
+from zstate.recording.model_edges import ModelEdgeFilter, select_edges
+from zstate.stream_registry import edge_streams, is_bulk, is_latched, is_measured, is_named, measured_streams
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import MODEL_WRITER, full_name
+from zstate.wire.measurements import renumbered, with_field
 from zstate.wire.messages import (
     Edges,
     JointState,
@@ -38,9 +40,6 @@ from zstate.wire.messages import (
     StampedMessage,
     StaticTransforms,
     TransformSample,
-    renumbered,
-    select_edges,
-    with_field,
 )
 from zstate.wire.protocol import carrier
 from zstate.wire.registry import get_wire

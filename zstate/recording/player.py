@@ -18,7 +18,6 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
-from zstate.plugins import latched_streams
 from zstate.recording.decode import (
     STREAMS,
     DecodedMessage,
@@ -35,6 +34,7 @@ from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
 from zstate.sources.joint_source import JointReading, JointStateValidator
+from zstate.stream_registry import latched_streams
 from zstate.wire.joint_order import JointNumbers
 from zstate.wire.messages import ClockMessage, JointState, StampedMessage
 from zstate.wire.registry import as_wire_names

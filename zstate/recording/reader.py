@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import quote
 
 from zstate._util.closeable import Closeable
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.file import McapFile, explain_unreadable, open_errors, split_files
 from zstate.recording.mcap.records import MAGIC
 from zstate.recording.storage import (
@@ -53,7 +53,8 @@ class RecordingReader(Closeable):
 
     ``path`` is an MCAP file, the first file of a split recording (the others are found in its folder), a
     .db3 file, or the folder of a bag, with or without metadata.yaml. The format is decided by the first
-    bytes of a file, not its name. Raises RecordingError for other files and unreadable ones.
+    bytes of a file, not its name. With ``is_alone`` a file is read without the other parts. Raises
+    RecordingError for other files and unreadable ones.
 
     A truncated or damaged file is read as far as possible: ``complete`` is then False, and ``losses``
     describes what is missing. Damage that is found only during a read raises RecordingError there.
@@ -61,9 +62,13 @@ class RecordingReader(Closeable):
     ``skipped`` are the channels that are not readable (see ``Channel``); their records are left out.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, is_alone: bool = False) -> None:
         self.path = Path(path)
-        files, missing = (bag_files(self.path), []) if self.path.is_dir() else split_files(self.path)
+        files, missing = [self.path], list[str]()
+        if self.path.is_dir():
+            files = bag_files(self.path)
+        elif not is_alone:
+            files, missing = split_files(self.path)
         self.storages: list[Storage] = []
         self._is_open = True
         try:

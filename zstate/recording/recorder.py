@@ -17,19 +17,28 @@ from typing import NamedTuple
 from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
-from zstate._util.format import html_of_fields
+from zstate._util.html import html_of_fields
 from zstate.clock import SystemClock, wait_interruptible
-from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
-from zstate.ingest.counters import Counters, GapCounter
+from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.ingest.counters import Counters
 from zstate.net.at_exit import forked_text
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.plugins import edge_streams, is_bulk, is_latched, is_named, latched_streams, measured_streams
 from zstate.rate import Rate
 from zstate.recording.encode import RecordingEncoder
+from zstate.recording.errors import RecordingError
+from zstate.recording.gap_counter import GapCounter
 from zstate.recording.mcap.writer import RecordingWriter
+from zstate.stream_registry import (
+    edge_streams,
+    is_bulk,
+    is_latched,
+    is_named,
+    latched_streams,
+    measured_streams,
+)
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, check_robot

@@ -35,10 +35,9 @@ from zstate.errors import InvalidInput
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest
+from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel
-from zstate.plugins import stream_named
 from zstate.recording.decode import (
     STREAMS,
     DecodedMessage,
@@ -54,8 +53,10 @@ from zstate.recording.decode import (
 from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.joint_parts import MergedJointStateReader, RecordedJoints, has_parts
 from zstate.recording.joint_states import RecordedJointReader
+from zstate.recording.model_edges import ModelEdgeFilter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.transforms import EdgeEpochs, RecordedTransformIngest, children_of
+from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
@@ -186,17 +187,8 @@ class Recording(Closeable):
         robots: Collection[str] | None,
         streams: Collection[StreamName],
     ) -> Iterator[DecodedMessage]:
-        feed_of(buffer).set_recording()
         recording = DecodedRecording(self._reader, counters.count_refusal)
-        shares_frames = any(
-            writer.foreign or (writer.stream == "tf_static" and writer.edge_writer is None)  # of ROS
-            for writer in recording.writers
-        )
-        loader = RecordingLoader(buffer, counters, () if shares_frames else recording.robots)
-        for description in first_descriptions(recording, robots).values():
-            model = recorded_model(recording, description, counters.count_refusal)
-            if model is not None:
-                loader.add_model(description, model)
+        loader = RecordingLoader.of(recording, buffer, counters, robots)
         for decoded in recording.messages(robots, streams):
             loader.insert(decoded)
             yield decoded
@@ -397,12 +389,37 @@ class RecordingLoader:
         self._filter = ModelEdgeFilter()
         self._epochs = EdgeEpochs()
 
+    @classmethod
+    def of(
+        cls,
+        recording: DecodedRecording,
+        buffer: TransformBuffer,
+        counters: Counters,
+        robots: Collection[str] | None,
+    ) -> RecordingLoader:
+        """A loader into an empty ``buffer``, with the first models of ``robots`` (None: of all)."""
+        feed_of(buffer).set_recording()
+        shares_frames = any(
+            writer.foreign or (writer.stream == "tf_static" and writer.edge_writer is None)  # of ROS
+            for writer in recording.writers
+        )
+        loader = cls(buffer, counters, () if shares_frames else recording.robots)
+        for description in first_descriptions(recording, robots).values():
+            model = recorded_model(recording, description, counters.count_refusal)
+            if model is not None:
+                loader.add_model(description, model)
+        return loader
+
     def add_model(self, description: DecodedMessage, model: RobotModel) -> None:
         """Insert the joint states of a robot with this ``model``. Call it before the first ``insert``."""
         robot = description.writer.robot
         self._filter.set_model(robot, model)
         self._joints[robot] = RecordedJoints(robot, self._ownership, self._filter)
         self.insert(description)
+
+    def leaves_out(self, robot: str, edges: Edges) -> bool:
+        """Whether models define all of the moving ``edges`` of ``robot``, and no sample of them counts."""
+        return bool(edges) and self._filter.removes_all(robot, edges)
 
     def insert(self, decoded: DecodedMessage) -> None:
         """Insert the next message."""

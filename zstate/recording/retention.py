@@ -12,7 +12,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -134,11 +134,11 @@ class Retention:
         self._pattern, self._is_split, self.keep = pattern, is_split, keep
         self.deleted_files = self.deleted_bytes = self.kept_bytes = 0
 
-    def delete_excess(self, current: Path) -> Iterator[RecordedFile]:
+    def delete_excess(self, used: Collection[Path]) -> Iterator[RecordedFile]:
         """Delete files, oldest first, until the rest is within the bound; the deleted ones.
 
-        ``current`` and other files that a recorder is writing count, and stay. A file that cannot be deleted
-        is logged, and stays.
+        Those in ``used``, the current one among them, and others that a recorder is writing count, and stay.
+        A file that cannot be deleted is logged, and stays.
         """
         try:
             files = self._pattern.recordings()
@@ -151,7 +151,7 @@ class Retention:
             is_old = now - file.modified > self.keep.max_age_s
             if not is_old and self.kept_bytes <= self.keep.max_bytes:
                 return
-            if file.path == current or _is_being_written(file.path):
+            if file.path in used or _is_being_written(file.path):
                 continue
             try:
                 file.path.unlink()

@@ -30,11 +30,12 @@ from numpy.typing import NDArray
 
 from zstate._util.lazy_names import loaded
 from zstate._util.refusals import Refusals
-from zstate.errors import InvalidInput, RecordingError
-from zstate.plugins import stream_named
+from zstate.errors import InvalidInput
 from zstate.recording.decode import DecodedMessage
+from zstate.recording.errors import RecordingError
 from zstate.recording.export import TableFormat, new_table
 from zstate.recording.recording import Recording
+from zstate.stream_registry import stream_named
 from zstate.streams import StreamName
 from zstate.wire.json_form import json_text
 from zstate.wire.keys import full_name

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from contextlib import suppress
 
+from zstate._util.bounded import BoundedDict
 from zstate.errors import InvalidInput
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.transforms import TransformIngest
 from zstate.recording.joint_states import DELAYED_NS
 from zstate.wire.keys import full_name
-from zstate.wire.messages import Edges, Sample, TransformSample, covariances_of, poses_from_block
+from zstate.wire.messages import Edges, Sample, TransformSample, covariances_of
 
 
 def children_of(robot: str, edges: Edges) -> set[str]:
@@ -28,20 +29,24 @@ class RecordedTransformIngest(TransformIngest):
         super().__init__(robot, ownership)
         self._epochs = epochs
         self._children: set[str] = set()
+        self._names: BoundedDict[Edges, tuple[Edges, tuple[str, ...]]] = BoundedDict()
 
     def _insert(self, sample: Sample) -> bool | None:
         assert isinstance(sample, TransformSample)
         assert sample.edges is not None
-        edges = self._named(sample.edges)
-        children = [child for _, child in edges]
-        if self._epochs.is_delayed(sample, children):
-            return False
-        self._children.update(children)
-        if self._epochs.is_new_epoch(sample, children):
-            self._drop_edges(set(children))
-        poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
+        names = self._names.get(sample.edges)
+        if names is None:
+            named = self._named(sample.edges)
+            names = self._names[sample.edges] = named, tuple(child for _, child in named)
+        edges, children = names
+        if not self._epochs.is_next(sample, children):
+            if self._epochs.is_delayed(sample, children):
+                return False
+            self._children.update(children)
+            if self._epochs.is_new_epoch(sample, children):
+                self._drop_edges(set(children))
         inserted = self._buffer.insert_many(
-            edges, sample.stamp, poses, covariances=covariances, writer=self.writer
+            edges, sample.stamp, sample.poses, covariances=covariances_of(sample), writer=self.writer
         )
         self._epochs.add(sample, children)
         return inserted
@@ -66,9 +71,18 @@ class EdgeEpochs:
         self._newest: dict[str, int] = {}
         self._delayed: dict[str, int] = {}
         self._sessions: set[tuple[int, str]] = set()
+        # The session and the edges of the last sample, whose newest stamp is that one: most samples are like
+        # the one before.
+        self._last: tuple[int, tuple[str, ...]] | None = None
+        self._last_stamp = 0
 
-    def is_delayed(self, sample: Sample, children: list[str]) -> bool:
+    def is_next(self, sample: TransformSample, children: tuple[str, ...]) -> bool:
+        """Whether it continues the last sample: of the same session and edges, with a later stamp."""
+        return self._last == (sample.session, children) and sample.stamp > self._last_stamp
+
+    def is_delayed(self, sample: TransformSample, children: tuple[str, ...]) -> bool:
         """Whether it is a single old sample, after which stamps may continue as before."""
+        self._note_last()
         limit = sample.stamp + DELAYED_NS
         if not any(limit < self._newest.get(child, limit) for child in children):
             self._delayed.pop(children[0], None)
@@ -79,7 +93,7 @@ class EdgeEpochs:
         self._delayed[children[0]] = sample.stamp
         return True
 
-    def is_new_epoch(self, sample: Sample, children: list[str]) -> bool:
+    def is_new_epoch(self, sample: TransformSample, children: tuple[str, ...]) -> bool:
         """Whether the clock went back: with a second old sample, or with another writer."""
         for child in children:
             newest = self._newest.get(child)
@@ -89,14 +103,27 @@ class EdgeEpochs:
                     return True
         return False
 
-    def add(self, sample: Sample, children: list[str]) -> None:
+    def add(self, sample: TransformSample, children: tuple[str, ...]) -> None:
         """Add an inserted sample."""
+        if self.is_next(sample, children):
+            self._last_stamp = sample.stamp
+            return
         for child in children:
             if sample.stamp > self._newest.get(child, sample.stamp - 1):
                 self._newest[child] = sample.stamp
             self._sessions.add((sample.session, child))
+        is_newest = all(self._newest[child] == sample.stamp for child in children)
+        self._last, self._last_stamp = (sample.session, children) if is_newest else None, sample.stamp
 
     def remove(self, children: set[str]) -> None:
         """Remove edges whose history restarts."""
+        self._note_last()
+        self._last = None
         for child in children:
             self._newest.pop(child, None)
+
+    def _note_last(self) -> None:
+        """Note the stamp of the last sample for each of its edges."""
+        if self._last is not None:
+            self._newest |= dict.fromkeys(self._last[1], self._last_stamp)
+            self._last = None

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from zstate.errors import InvalidInput, MessageError
 from zstate.message import Count, Message, SessionId, Stamp, StampedMessage
 from zstate.streams import GRID_CELLS, LATCHED_BYTES
-from zstate.wire.messages import FLOAT32_BYTES, POSE_BYTES, Interval, check_finite, check_frame, from_block
+from zstate.wire.measurements import FLOAT32_BYTES, check_finite, check_frame
+from zstate.wire.messages import POSE_BYTES, Interval, from_block
 
 _DEFLATED_BYTES = 64_000
 _DEFLATED = b"\x78"

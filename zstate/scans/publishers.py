@@ -12,8 +12,8 @@ from zstate.clock import Clock, check_stamp
 from zstate.errors import InvalidInput
 from zstate.net.session import Session
 from zstate.net.writer import write_all
+from zstate.nodes.measurement_publisher import MeasurementPublisher
 from zstate.nodes.robot_writer import RobotWriter
-from zstate.nodes.sample_publisher import MeasurementPublisher
 from zstate.nodes.static_publisher import ValuePublisher
 from zstate.rate import RateReport
 from zstate.scans.grid import Grid, grid_to_message

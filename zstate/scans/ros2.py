@@ -7,7 +7,8 @@ from math import isfinite
 
 from zstate.errors import InvalidInput
 from zstate.scans.messages import LaserScan, OccupancyGrid
-from zstate.wire.messages import FLOAT32_BYTES, to_block
+from zstate.wire.measurements import FLOAT32_BYTES
+from zstate.wire.messages import to_block
 from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.streams import RosStream

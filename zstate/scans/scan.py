@@ -20,7 +20,7 @@ from zstate.clock import check_stamp, format_stamp
 from zstate.errors import InvalidInput
 from zstate.scans.messages import LaserScan
 from zstate.wire.keys import full_name
-from zstate.wire.messages import from_float32_block, to_float32_block
+from zstate.wire.measurements import from_float32_block, to_float32_block
 
 Floats32 = NDArray[np.float32]
 

@@ -6,7 +6,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -101,6 +101,8 @@ def _point(text: str) -> tuple[float, float, float]:
     help="Initial position of the camera and, after the colon, the point it looks at [m, fixed frame]; "
     "default: all robots in sight.",
 )
+@click.option("--robot", "archived", metavar="ROBOT", help="The robot of an archive.")
+@options.window_options
 @options.placer_option
 @options.wire_option
 @options.reading_clock_option
@@ -117,6 +119,8 @@ def view_command(
     size: tuple[int, int],
     fixed_frame: str,
     camera: Camera | None,
+    archived: str | None,
+    window: tuple[int, int] | None,
     placers: tuple[str, ...] | None,
     wire: str,
     clock: str | None,
@@ -129,8 +133,8 @@ def view_command(
 
     With --sliders you move each ROBOT from the page: an announced robot, or a name or file as for `zstate
     publish`, with NAME:=VALUE for xacro. It must have no other writer of joint states than its driver. A
-    ROBOT may also be a recording. --snapshot needs an installed Chromium, but no screen. Needs viser: pip
-    install 'zstate[view]'.
+    ROBOT may also be a recording, or an archive with --robot and a window. --snapshot needs an installed
+    Chromium, but no screen. Needs viser: pip install 'zstate[view]'.
 
     A robot with a driver has a stop button; it is no emergency stop. With --sliders a browser can take
     control of the driver. It then commands each joint from the first move of its slider, until it releases
@@ -148,6 +152,7 @@ def view_command(
     zstate view panda --sliders
     zstate view arm.urdf.xacro prefix:=left_ --sliders
     zstate view run.mcap
+    zstate view s3://plant/fleet --robot robot17 --at 2026-11-20T14:03    # a minute of an archive
     zstate view --wire ros2                 # robots of ROS 2 nodes that run rmw_zenoh
     zstate view panda --snapshot panda.png --camera 2,1,1:0,0,0.5
     zstate view urdf/arm.urdf               # announced robot 'arm', with the meshes near this file
@@ -158,18 +163,14 @@ def view_command(
     check_libraries()  # before anything starts
     from zstate.cli.processes import BackgroundCall
     from zstate.model.load import is_path
+    from zstate.recording.stores import opened_path
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
     from zstate.web_access import is_loopback
 
     models = parse_models(robots)
-    files = [Path(one) for one in models if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
-    if files and len(models) > 1:
-        raise click.UsageError(f"a recording must be the only argument; got {', '.join(models)}")
-    if files and (sliders or placers is not None):
-        what = "--sliders moves" if sliders else "--placer is for"
-        raise click.UsageError(f"{what} live robots, not those of a recording")
+    files = _recordings(models, is_live=sliders or placers is not None, has_window=bool(archived or window))
     named = [
         _load_named(one, xacro_args)[0] if xacro_args or is_path(one) else NamedRobot(one)
         for one, xacro_args in ({} if files else models).items()
@@ -177,7 +178,8 @@ def view_command(
     with ExitStack() as opened:
         publishers: list[SliderPublisher] = []
         if files:
-            source = opened.enter_context(ViewSource.from_recording(files[0]))
+            recording = opened.enter_context(opened_path(files[0], archived, window))
+            source = opened.enter_context(ViewSource.from_recording(recording.path))
         else:
             session = opened.enter_context(open_session(network, (wire,)))
             if sliders:
@@ -231,6 +233,21 @@ def view_command(
                 call.result(_ENDS_WITHIN_S)
 
 
+def _recordings(models: Collection[str], *, is_live: bool, has_window: bool) -> list[str]:
+    """The only argument, if it is a recording or an archive. Raises UsageError for others beside it."""
+    from zstate.recording.stores import find_store
+
+    is_archive = any(map(find_store, models))
+    files = [one for one in models if is_archive or Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
+    if has_window and not is_archive:
+        raise click.UsageError("--robot, --at, --from and --to are for an archive: name it as ROBOT")
+    if files and len(models) > 1:
+        raise click.UsageError(f"a recording must be the only argument; got {', '.join(models)}")
+    if files and is_live:
+        raise click.UsageError("--sliders and --placer are for live robots, not those of a recording")
+    return files
+
+
 class NamedRobot(NamedTuple):
     """A ROBOT argument: the robot's name; for a local model also the model and the folder of its file."""
 
@@ -255,7 +272,7 @@ def _open_sliders(
 
     A name is that of an announced robot; if no such robot is announced, that of a catalog model.
     """
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.view.sliders import SliderPublisher
 
     within_s = _DISCOVERY_S if named else _ANNOUNCED_WITHIN_S

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.plugins import is_named
+from zstate.stream_registry import is_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import MAX_NAME_LENGTH, check_writer, shortened
 

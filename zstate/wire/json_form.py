@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, cast
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import is_measured, is_value
+from zstate.stream_registry import is_measured, is_value
 from zstate.streams import Stream, StreamName
 from zstate.wire.messages import Message, StampedMessage
 from zstate.wire.ros2.streams import ros_streams

@@ -17,7 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVarTuple, cast
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
-from zstate.plugins import all_streams, find_stream, in_canonical_order, is_named
+from zstate.stream_registry import all_streams, find_stream, in_canonical_order, is_named
 from zstate.streams import StreamName
 
 CLOCK_KEY = "zstate/clock"

@@ -1,4 +1,4 @@
-"""Message types of the core on the native wire (frozen msgspec structs), and what those of plugins share.
+"""Message types of the core on the native wire (frozen msgspec structs).
 
 A block is the bytes of consecutive little-endian float64: ``to_block`` makes one of an array, ``from_block``
 reads it without a copy. Fields are encoded by position, so a later
@@ -8,26 +8,21 @@ the memory that a writer can make a reader use.
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from hashlib import blake2b
-from itertools import takewhile
-from math import isfinite, sqrt
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.checks import QUATERNION_TOLERANCE
 from zstate.errors import InvalidInput, MessageError
 from zstate.message import Count, Message, SessionId, Stamp, StampedMessage
-from zstate.plugins import stream_named
+from zstate.stream_registry import stream_named
 from zstate.streams import KILOBYTE, SAMPLE_BYTES, StreamName
 from zstate.transform import COVARIANCE_NUMBERS
-from zstate.wire.keys import MAX_FRAME_NAME_LENGTH
 
 Edges = tuple[tuple[str, str], ...]
 Interval = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -35,10 +30,7 @@ Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
-_UPPER_TRIANGLES = {size: np.triu_indices(size) for size in (3, 6)}
 _FLOAT64 = np.dtype("<f8")
-_FLOAT32 = np.dtype("<f4")
-FLOAT32_BYTES = 4
 
 
 def to_block(values: ArrayLike) -> bytes:
@@ -49,16 +41,6 @@ def to_block(values: ArrayLike) -> bytes:
 def from_block(block: bytes) -> NDArray[np.float64]:
     """The numbers of a block: (n,), read-only, sharing the block's memory."""
     return np.frombuffer(block, dtype=_FLOAT64)
-
-
-def to_float32_block(values: ArrayLike) -> bytes:
-    """``to_block`` in float32."""
-    return np.asarray(values, dtype=_FLOAT32).tobytes()
-
-
-def from_float32_block(block: bytes) -> NDArray[np.float32]:
-    """``from_block`` in float32."""
-    return np.frombuffer(block, dtype=_FLOAT32)
 
 
 def poses_from_block(block: bytes) -> NDArray[np.float64]:
@@ -79,24 +61,10 @@ def _order_digest(order: tuple[object, ...]) -> bytes:
     return blake2b(msgspec.msgpack.encode(order), digest_size=8).digest()
 
 
-M = TypeVar("M", bound=Message)
-_Stamped = TypeVar("_Stamped", bound=StampedMessage)
-
-
-def renumbered(message: _Stamped, seq: int, session: int) -> _Stamped:
-    """The same message as that of another ``session``, in which it has the number ``seq``."""
-    return msgspec.structs.replace(message, seq=seq, session=session)
-
-
 def session_of(message: Message) -> int:
     """The session of the writer of ``message``, which all messages of streams have."""
     session: int = getattr(message, "session")  # noqa: B009 - their classes have no other base in common
     return session
-
-
-def with_field(message: M, name: str, value: object) -> M:
-    """The same message with another value of the field ``name``."""
-    return msgspec.structs.replace(message, **{name: value})
 
 
 class Sample(StampedMessage, frozen=True, array_like=True, gc=False):
@@ -177,31 +145,6 @@ def covariances_of(sample: TransformSample) -> NDArray[np.float64] | None:
     return from_block(sample.covariances).reshape(-1, COVARIANCE_NUMBERS)
 
 
-def select_edges(sample: TransformSample, edges: Edges, rows: Sequence[int]) -> TransformSample:
-    """The ``rows`` of a sample of ``edges``."""
-    chosen = tuple(edges[row] for row in rows)
-    head = (sample.stamp, sample.seq, sample.session, order_digest(chosen))
-    poses, covariances = poses_from_block(sample.poses), covariances_of(sample)
-    if covariances is None:
-        return TransformSample(*head, to_block(poses[rows]), chosen)
-    return WriterTransforms(*head, to_block(poses[rows]), chosen, to_block(covariances[rows]))
-
-
-def message_fields(message: Message) -> dict[str, Any]:
-    """The fields of a message without blocks by name, as JSON has them."""
-    return dict(zip(message.__struct_fields__, msgspec.to_builtins(message), strict=True))
-
-
-def message_from_fields(kind: type[M], fields: Mapping[str, Any]) -> M:
-    """The message with these ``fields``; others are ignored. Raises MessageError ("malformed")."""
-    # Fields are appended only: those that a file of an earlier version lacks are the last ones.
-    known = takewhile(fields.__contains__, kind.__struct_fields__)
-    try:
-        return msgspec.convert([fields[name] for name in known], kind)
-    except msgspec.ValidationError as error:
-        raise MessageError(f"a malformed {kind.__name__}: {error}", reason="malformed") from None
-
-
 class StaticTransforms(Message, frozen=True, array_like=True, gc=False):
     """All static edges of one writer: row i of ``poses`` is ``parent_from_child`` of ``edges[i]``."""
 
@@ -227,14 +170,6 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
     joint_names: tuple[str, ...]
     moving_edges: Edges
     clock: str = "system"
-
-
-def covariance_matrix(triangle: bytes) -> NDArray[np.float64]:
-    """The matrix with an upper triangle, a block row by row: (3, 3) of 6 numbers, (6, 6) of 21."""
-    size = 3 if len(triangle) == 6 * 8 else 6
-    matrix, upper = np.empty((size, size)), _UPPER_TRIANGLES[size]
-    matrix[upper] = matrix.T[upper] = from_block(triangle)
-    return matrix
 
 
 class ClockMessage(StampedMessage, frozen=True, array_like=True, gc=False):
@@ -295,61 +230,6 @@ def check_named(names: Sequence[str], *blocks: bytes | None) -> None:
     for block in blocks:
         if block is not None and len(block) != 8 * len(names):
             raise InvalidInput(f"{len(names)} names need as many numbers, not {len(block) // 8}")
-
-
-def check_frame(frame: str) -> None:
-    """Raise InvalidInput unless ``frame`` is the name of a frame, bare or with that of its robot."""
-    if not 0 < len(frame) <= MAX_FRAME_NAME_LENGTH:
-        raise InvalidInput(
-            f"the name of a frame has 1 to {MAX_FRAME_NAME_LENGTH} characters, not {len(frame)}; name the "
-            "frame of the measurement or of the grid"
-        )
-    if frame[0] == "/" or frame[-1] == "/" or not frame.isprintable():
-        raise InvalidInput(
-            f"{frame!r} is no name of a frame: it has a slash at its end, or control characters; write "
-            "'frame' or 'robot/frame'"
-        )
-
-
-def check_finite(what: str, *numbers: float) -> None:
-    """Raise InvalidInput unless ``numbers``, of ``what``, are finite."""
-    if not all(map(isfinite, numbers)):
-        raise InvalidInput(f"{what} of finite numbers are needed, not {', '.join(map(str, numbers))}")
-
-
-def finite_numbers(what: str, block: bytes, count: int) -> tuple[float, ...]:
-    """The numbers of ``block``. Raises InvalidInput unless they are ``count`` finite ones."""
-    if len(block) != 8 * count:
-        raise InvalidInput(f"{what} of {count} numbers take {8 * count} bytes, not {len(block)}")
-    numbers = struct.unpack(f"<{count}d", block)
-    check_finite(what, *numbers)
-    return numbers
-
-
-def check_limit(what: str, numbers: Sequence[float], limit: float) -> None:
-    """Raise InvalidInput if one of ``numbers``, of ``what``, is beyond ``limit`` in either direction."""
-    if max(map(abs, numbers)) > limit:
-        raise InvalidInput(f"{what} of sensors are at most {limit:g}; got {', '.join(map(str, numbers))}")
-
-
-def check_quaternion(quaternion: Sequence[float]) -> None:
-    """Raise InvalidInput unless ``quaternion`` has the length 1."""
-    length = sqrt(sum(number * number for number in quaternion))
-    if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
-        raise InvalidInput(f"an orientation is a quaternion of length 1, not {length:.6g}")
-
-
-def check_covariance(what: str, triangle: bytes | None, size: int) -> None:
-    """Raise InvalidInput unless it is None or the upper triangle of a covariance of ``size`` numbers."""
-    if triangle is None:
-        return
-    numbers = finite_numbers(f"a covariance of {what}", triangle, size * (size + 1) // 2)
-    first, variances = 0, list[float]()
-    for row in range(size):
-        variances.append(numbers[first])
-        first += size - row
-    if min(variances) < 0.0:
-        raise InvalidInput(f"variances of {what} are not negative; got {variances}")
 
 
 def check_poses(block: bytes, edges: Edges | None) -> None:

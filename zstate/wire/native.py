@@ -6,25 +6,19 @@ docs/wire.md is its specification.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.plugins import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
-from zstate.streams import BULK_BYTES, Stream, StreamName
+from zstate.stream_registry import all_streams, edge_streams, find_stream, is_named, is_own, stream_named
+from zstate.streams import BULK_BYTES, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.messages import (
-    JointState,
-    Message,
-    StampedMessage,
-    check_edges,
-    check_size,
-)
+from zstate.wire.messages import JointState, Message, check_edges, check_size
 from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
 
 VERSION = 1
@@ -74,21 +68,6 @@ def _type_name(kind: type[Message]) -> str:
 def encode(message: Message) -> bytes:
     """The payload of ``message``; its Zenoh encoding is ``encoding_of(type(message))``."""
     return message.pack(_ENCODER.encode(message))
-
-
-def new_message(row: Stream, stamp: int, fields: Mapping[str, Any]) -> StampedMessage:
-    """The message of ``row`` with ``fields``, not numbered yet.
-
-    Raises InvalidInput for fields that it does not have, that are missing, or of other types.
-    """
-    kind = row.type
-    assert issubclass(kind, StampedMessage)  # of measurements
-    try:
-        # Types are checked as a reader does it: a constructor checks none.
-        return msgspec.msgpack.decode(_ENCODER.encode(kind(stamp, 0, 0, **fields)), type=kind)
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        own = ", ".join(kind.__struct_fields__[len(StampedMessage.__struct_fields__) :])
-        raise InvalidInput(f"no message of {row.name}, whose fields are {own}: {error}") from None
 
 
 def decode(payload: bytes, encoding: str, kind: type[M]) -> M:

@@ -7,7 +7,7 @@ from helpers.cli_runner import Spawn, failure, interrupted, started
 from helpers.processes import SOON_S, until
 
 from zstate import PartialStatePublisher, TransformListener, connect, load_model
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 
 
 @pytest.mark.processes

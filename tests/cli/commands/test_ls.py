@@ -23,7 +23,7 @@ from helpers.programs import moving_edge
 
 from zstate import StaticPublisher, connect
 from zstate.cli.commands.ls import robots_text
-from zstate.net.presence import RobotInfo
+from zstate.net.discovery import RobotInfo
 from zstate.net.topic_statistics import TopicStatistics
 from zstate.wire.identity import WriterId
 from zstate.wire.registry import get_wire

@@ -21,7 +21,8 @@ from zstate import PartialStatePublisher, StatePublisher, StaticPublisher, Trans
 from zstate.cli.doctor.robot_probe import RobotProbe, StreamCollector
 from zstate.clock import ManualClock, SystemClock
 from zstate.driving import Commander, stop
-from zstate.net.presence import announce, discover, discover_readers, local_writer
+from zstate.net.discovery import discover, discover_readers
+from zstate.net.presence import announce, local_writer
 from zstate.net.security.credentials import Credentials
 from zstate.nodes.clock import ClockPublisher
 from zstate.nodes.listener import TransformListener

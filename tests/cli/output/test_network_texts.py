@@ -8,8 +8,8 @@ from zstate.cli.commands.monitor import _driver_text
 from zstate.cli.doctor.check import Check, check_text, conclusion_text
 from zstate.cli.output.joint_state_text import yaml_text
 from zstate.driving.driver_state import ReceivedState
+from zstate.driving.errors import MotionRefused
 from zstate.driving.messages import DriverState, MotionOutcome, state_text
-from zstate.errors import MotionRefused
 
 FORGED = "x\nok       all is well\r\x1b[2J"
 STATE = DriverState(

@@ -10,7 +10,7 @@ from helpers.recording_files import DESCRIPTION, START, S, declare_channels, joi
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.recover import recover
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.recording.reader import RecordingReader

@@ -25,7 +25,8 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.index import Summary
 from zstate.recording.mcap.records import BoundedFile
 from zstate.recording.mcap.writer import MIN_BYTES, RecordingWriter
@@ -268,7 +269,7 @@ FULL = """
     import resource, signal, sys
     sys.path.insert(0, sys.argv[2])
     from helpers.recording_files import *
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
     writer = RecordingWriter(sys.argv[1])
     described, joints = declare_channels(writer)
@@ -312,7 +313,7 @@ def test_full_disk_error_says_so():
 
 REPEATED_STARTS_ON_A_FULL_DISK = """
 import os, resource, signal, sys
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.index import Summary
 from zstate.recording.mcap.records import BoundedFile
 from zstate.recording.mcap.writer import RecordingWriter

@@ -79,7 +79,7 @@ def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it():
     [
         (["--snapshot", "picture.jpg"], 2, "'picture.jpg' does not end with .png"),
         (["a.mcap", "b.mcap"], 2, "a recording must be the only argument; got a.mcap, b.mcap"),
-        (["a.mcap", "--sliders"], 2, "--sliders moves live robots"),
+        (["a.mcap", "--sliders"], 2, "--sliders and --placer are for live robots"),
         (["nowhere.mcap"], 1, "nowhere.mcap"),
         (["--rate", "0"], 2, "a rate is above 0"),
         (["--host", "nowhere.invalid"], 1, "cannot listen at 'nowhere.invalid'"),

@@ -17,7 +17,7 @@ from helpers.processes import until as until_then
 from zstate import Transform, TransformPublisher
 from zstate.model.load import load_model
 from zstate.model.urdf import parse_urdf
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import OdometrySource, SquareDrive, WheelPair, WheelSource

@@ -23,7 +23,7 @@ from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_r
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
 from zstate.model.robot import velocity_columns_by_position
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher

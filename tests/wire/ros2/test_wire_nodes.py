@@ -25,7 +25,7 @@ from helpers.robots import RRBOT, STAMP, wait_for_reader
 
 from zstate.model.kinematics import MovingEdges
 from zstate.model.robot import RobotModel
-from zstate.net.presence import discover
+from zstate.net.discovery import discover
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher

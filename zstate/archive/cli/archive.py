@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from zstate.archive.importer import ImportReport
 
 _LINE_S = 2.0
-_MINUTE_NS = 60 * 10**9
 _DAYS = {"d": 1, "w": 7}
 
 
@@ -31,19 +30,6 @@ def _date_before(text: str) -> str:
         return str(datetime.strptime(text, "%Y-%m-%d").date())
     except ValueError:
         raise InvalidInput(f"{text!r} is no date like 2026-08-01, and no time like 90d or 12w") from None
-
-
-def _stamp(text: str) -> int:
-    """The stamp [ns] of ``text``: UTC in ISO 8601, or itself."""
-    if re.fullmatch(r"\d{15,19}", text, re.ASCII):
-        return int(text)
-    try:
-        seconds = datetime.fromisoformat(text)
-    except ValueError:
-        raise InvalidInput(f"{text!r} is no time like 2026-11-20T14:03, and no stamp [ns]") from None
-    if seconds.tzinfo is None:
-        seconds = seconds.replace(tzinfo=UTC)
-    return (seconds - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
 class _ArchiveGroup(click.Group):
@@ -82,7 +68,8 @@ def archive_command(context: click.Context, *, url: str, recordings: tuple[str, 
     zstate archive fleet --from monday/*.mcap           # add recordings
     zstate archive fleet                                # robots, and since when
     zstate archive s3://plant/fleet --from run.mcap
-    zstate archive fleet cut minute.mcap robot17 --at 2026-11-20T14:03   # for view, plot, export, replay
+    zstate view fleet --robot robot17 --at 2026-11-20T14:03
+    zstate archive fleet cut minute.mcap robot17 --at 2026-11-20T14:03   # for replay, info, foxglove
     zstate archive fleet check                          # checksums of all files
     zstate archive fleet expire --before 90d
     zstate archive fleet forget robot17
@@ -100,7 +87,7 @@ def archive_command(context: click.Context, *, url: str, recordings: tuple[str, 
 
 def _add(url: str, recordings: tuple[str, ...]) -> None:
     from zstate.archive.importer import import_recording
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
 
     failed: list[str] = []
     for recording in recordings:
@@ -166,14 +153,12 @@ def _date_text(stamp: int) -> str:
 @archive_command.command("cut")
 @click.argument("file", metavar="FILE")
 @click.argument("robot")
-@click.option("--at", "at", type=options.Checked("TIME", _stamp), help="The minute that begins then.")
-@click.option("--from", "start", type=options.Checked("TIME", _stamp), help="From this time on.")
-@click.option("--to", "end", type=options.Checked("TIME", _stamp), help="Up to this time.")
+@options.window_options
 @click.pass_obj
-def cut_command(
-    url: str, *, file: str, robot: str, at: int | None, start: int | None, end: int | None
-) -> None:
-    """Write a window of ROBOT as a recording, which view, plot, export, replay and info open.
+def cut_command(url: str, *, file: str, robot: str, window: tuple[int, int] | None) -> None:
+    """Write a window of ROBOT as a recording, which replay, info and foxglove open.
+
+    `zstate view`, `plot` and `export` take the archive itself.
 
     A TIME is UTC as 2026-11-20T14:03, 2026-11-20T14:03:05.25, or a stamp in nanoseconds.
 
@@ -183,14 +168,12 @@ def cut_command(
     zstate view minute.mcap
     """
     from zstate.archive.cut import cut
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
 
-    if at is not None and start is None and end is None:
-        start, end = at, at + _MINUTE_NS
-    elif at is not None or start is None or end is None:
+    if window is None:
         raise click.UsageError("name the window by --at TIME, or by --from TIME --to TIME")
     try:
-        written = cut(url, Path(file), robot, start, end)
+        written = cut(url, Path(file), robot, *window)
     except RecordingError as error:
         fail(str(error))
     counts = ", ".join(f"{count} {stream}" for stream, count in sorted(written.items()))

@@ -55,7 +55,7 @@ def bridge_command(
     """
     from zstate.bridges.ros2 import Bridge
     from zstate.clock import wait_interruptible
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
     from zstate.wire.ros2.wire import Ros2Wire

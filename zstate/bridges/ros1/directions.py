@@ -35,9 +35,9 @@ from zstate.net.subscription import Received, subscribe
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.nodes.transform_publisher import TransformPublisher
-from zstate.plugins import edge_streams
 from zstate.sources.joint_state_listener import MAX_AGE_S
 from zstate.sources.joint_state_merger import JointStateMerger
+from zstate.stream_registry import edge_streams
 from zstate.streams import JOINT_STREAMS
 from zstate.transform import Transform
 from zstate.wire.joint_order import JointNumbers

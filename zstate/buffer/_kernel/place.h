@@ -88,9 +88,10 @@ write_point(Placing *placing, Py_ssize_t i, const double p[3])
     placing->valid[i] = sum == 0.0;
 }
 
-/* A lidar with several beams repeats its stamps for each of them. Their poses are kept, each in the
- * slot that its stamp selects, until another stamp needs the slot. Slots are selected by
- * multiplicative hashing (Knuth, TAOCP 6.4), which spreads stamps at a constant rate evenly. */
+/* A lidar with several beams repeats its stamps for each of them. Their poses are kept, each in one
+ * of the two slots that its stamp selects, until another stamp needs the slot. Slots are selected by
+ * multiplicative hashing (Knuth, TAOCP 6.4), which spreads stamps at a constant rate evenly; those of
+ * a real sensor vary by microseconds, and one slot each would be shared by a fifth of 1024. */
 #define SLOT_BITS 12
 #define SLOTS (1 << SLOT_BITS)
 
@@ -116,12 +117,23 @@ are_repeated(const int64_t *stamps, Py_ssize_t count)
     return repeated > count - count / 3;
 }
 
+/* The slot with the pose of an instant, or the one for it: the first of its two, unless only the second
+ * is free. */
+static inline KeptPose *
+find_slot(KeptPose *kept, int64_t at)
+{
+    KeptPose *first = &kept[slot_of(at)], *second = &kept[slot_of(at) ^ 1];
+    if (!first->is_used || first->stamp == at)
+        return first;
+    return !second->is_used || second->stamp == at ? second : first;
+}
+
 /* The pose at an instant, NaN without one. */
 static Pose
 pose_or_nan(Placing *placing, int64_t at)
 {
     Pose pose = {Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN};
-    KeptPose *slot = placing->kept == NULL ? NULL : &placing->kept[slot_of(at)];
+    KeptPose *slot = placing->kept == NULL ? NULL : find_slot(placing->kept, at);
     if (slot != NULL && slot->is_used && slot->stamp == at)
         return slot->pose;
     batch_pose(placing->path, &placing->batch, at, &pose);

@@ -8,7 +8,8 @@ import click
 
 from zstate._util.lazy_names import loaded
 from zstate.cli.output.console import fail
-from zstate.plugins import Command, built_in_plugins, found_plugins
+from zstate.other_plugins import found_plugins
+from zstate.plugins import Command, built_in_plugins
 
 _CORE = {
     "demo": ("Start here", "A robot that moves, its state over Zenoh, and a live table of it."),

@@ -172,7 +172,8 @@ def _option_settings(context: click.Context) -> Iterator[Setting]:
 
 def _file_settings(context: click.Context, file: str) -> Iterator[Setting]:
     """Mode and endpoints with a Zenoh configuration file."""
-    from zstate.net.config import check_mode, user_config
+    from zstate.net.config import check_mode
+    from zstate.net.user_config import user_config
 
     params = context.params
     network = SessionOptions(params["mode"], params["connect"], params["listen"], file)
@@ -217,7 +218,8 @@ def _site_settings(config: Mapping[str, Any], origin: str) -> Iterator[Setting]:
 
 def _zenoh_settings(context: click.Context) -> dict[str, Any]:
     """Zenoh settings that differ from Zenoh's defaults, by their path in its configuration."""
-    from zstate.net.config import check_mode, default_config, listen_endpoints, user_config
+    from zstate.net.config import check_mode, default_config, listen_endpoints
+    from zstate.net.user_config import user_config
 
     network = _network(context)
     mode = check_mode(network.joins_as)

@@ -193,7 +193,7 @@ class _Names:
 
     def __init__(self, session: Session) -> None:
         from zstate.cli.processes import BackgroundCall
-        from zstate.net.presence import discover
+        from zstate.net.discovery import discover
 
         # Without any robot it takes a second, in which the model is loaded.
         self._robots = BackgroundCall("zstate discovery", lambda: discover(session))

@@ -100,7 +100,7 @@ def echo_command(
     )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
-    from zstate.plugins import stream_named
+    from zstate.stream_registry import stream_named
     from zstate.wire.messages import JointState
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire

@@ -77,11 +77,11 @@ def graph_command(network: SessionOptions, robot: str, form: str | None, wire: s
 def _discover_measured_graph(session: Session) -> Graph:
     """The graph of the native wire, with the rates of the streams that move."""
     from zstate.cli.robot_directory import check_found
+    from zstate.net.discovery import discover, discover_readers
     from zstate.net.graph import build_graph
-    from zstate.net.presence import discover, discover_readers
     from zstate.net.sites import discover_sites
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.plugins import edge_streams, measured_streams
+    from zstate.stream_registry import edge_streams, measured_streams
     from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
 

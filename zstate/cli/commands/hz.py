@@ -71,7 +71,7 @@ def hz_command(
     """
     from zstate.cli.stream_reader import StreamReader
     from zstate.net.sites import discover_sites
-    from zstate.plugins import is_named
+    from zstate.stream_registry import is_named
     from zstate.wire.protocol import carrier
     from zstate.wire.registry import get_wire
 

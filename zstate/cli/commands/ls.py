@@ -29,8 +29,8 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import format_duration
 
 if TYPE_CHECKING:
+    from zstate.net.discovery import RobotInfo
     from zstate.net.graph import RosEndpoint, RosGraph
-    from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.net.sites import Sites
     from zstate.net.topic_statistics import TopicStatistics
@@ -98,10 +98,10 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_directory import RobotDirectory, check_found
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.net.sites import discover_sites
     from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
-    from zstate.plugins import streams_where
+    from zstate.stream_registry import streams_where
     from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:

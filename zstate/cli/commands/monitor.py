@@ -32,7 +32,7 @@ from zstate.cli.output.wire_text import default_stream, is_ros
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import printable
-from zstate.plugins import edge_streams, is_bulk, is_own, measured_streams
+from zstate.stream_registry import edge_streams, is_bulk, is_own, measured_streams
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.keys import ANY, check_robot
 

@@ -23,7 +23,7 @@ def plugins_command(*, as_json: bool) -> None:
     zstate plugins --json
     """
     from zstate.cli.commands import own_commands
-    from zstate.plugins import found_plugins
+    from zstate.other_plugins import found_plugins
 
     own = own_commands()
     facts: list[dict[str, Any]] = []

@@ -117,9 +117,24 @@ def publish_command(
         open_session(network, wires) as session,
         open_clock(session, clock, wires[0]) as time,
         StatePublisher(
-            session, model, robot_name, derived_wires, streams=_DERIVED, clock=time, takeover=takeover
+            session,
+            model,
+            robot_name,
+            derived_wires,
+            streams=_DERIVED,
+            clock=time,
+            takeover=takeover,
+            pinocchio_on_demand=True,
         ) as derived,
-        StatePublisher(session, model, robot_name, whole_wires, clock=time, takeover=takeover) as whole,
+        StatePublisher(
+            session,
+            model,
+            robot_name,
+            whole_wires,
+            clock=time,
+            takeover=takeover,
+            pinocchio_on_demand=True,
+        ) as whole,
         serve_metrics(metrics, publisher_rows(derived, whole)),
     ):
         places = [messages_for(wire).topics(robot_name, _DERIVED) for wire in derived_wires]

@@ -153,7 +153,7 @@ def owner_in_names(edge: Transform, wires: tuple[str, ...]) -> str | None:
 
 def only_owner(session: Session, wires: tuple[str, ...]) -> str:
     """The only announced robot, or the one that ``wires`` can mean. Ends the command without one."""
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
 
     if "native" in wires:
         print_status("looking for the robot that owns this edge ...")

@@ -28,7 +28,7 @@ from zstate.cli.session import SessionOptions, open_session
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
     from zstate.cli.output.drawing import Drawing
-    from zstate.net.presence import RobotInfo
+    from zstate.net.discovery import RobotInfo
     from zstate.net.session import Session
     from zstate.nodes.listener import TransformListener
 
@@ -107,7 +107,7 @@ def _collect_frames(
     from zstate.cli.processes import BackgroundCall
     from zstate.cli.robot_directory import announced_robots
     from zstate.cli.waiting import ConditionWaiter
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.streams import JOINT_STREAMS
     from zstate.wire.keys import ANY, MODEL_WRITER
 

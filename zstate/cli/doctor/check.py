@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from zstate.cli.output.console import colored, count_text, output_width
 from zstate.errors import printable
-from zstate.plugins import edge_streams
+from zstate.stream_registry import edge_streams
 from zstate.streams import JOINT_STREAMS
 
 State = Literal["ok", "warning", "broken", "skipped"]

@@ -11,7 +11,7 @@ from zstate.errors import NoClock, format_duration
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.topic_statistics import IntervalStatistics, Window
-from zstate.plugins import measured_streams
+from zstate.stream_registry import measured_streams
 
 _DISTURBS_NS = 20_000_000
 _BREAKS_NS = 1_000_000_000

@@ -25,14 +25,10 @@ from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.model.pinocchio_solver import select_engine
 from zstate.net.config import ROUTER_ENDPOINT
-from zstate.net.presence import RobotInfo, announce, connections, discover
+from zstate.net.discovery import RobotInfo, connections, discover
+from zstate.net.presence import announce
 from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
-from zstate.net.security.connection_check import (
-    check_all_tcp,
-    check_connections,
-    check_rendezvous,
-    check_tcp,
-)
+from zstate.net.security.connection_check import check_all_tcp, check_connections, check_rendezvous, check_tcp
 from zstate.net.session import Session
 from zstate.wire.keys import ANY
 
@@ -192,7 +188,7 @@ def _rendezvous_check(session: Session) -> Check:
 
 def _access_check(session: Session, network: SessionOptions, robot: str) -> Check | None:
     """Whether an identity named ``robot`` may write as that robot; None for other identities."""
-    from zstate.net.writer import check_may_write
+    from zstate.net.security.write_permission import check_may_write
 
     credentials = network.credentials
     if robot == ANY or session.probe is None or credentials is None:

@@ -10,9 +10,10 @@ from zstate._util.closeable import Closeable
 from zstate._util.lazy_names import loaded
 from zstate.cli.doctor.check import Check, warning
 from zstate.errors import printable
-from zstate.net.presence import RobotInfo
+from zstate.net.discovery import RobotInfo
 from zstate.net.session import Session
-from zstate.plugins import built_in_plugins, found_plugins
+from zstate.other_plugins import found_plugins
+from zstate.plugins import built_in_plugins
 from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 

@@ -17,7 +17,7 @@ from zstate.model.robot import RobotModel, coordinate_names, representative_link
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
-from zstate.plugins import is_named
+from zstate.stream_registry import is_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem, full_name

@@ -23,7 +23,7 @@ from zstate.ingest.counters import ListenerStats
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset, measure_offsets, unanswered
-from zstate.net.presence import RobotInfo, discover, discover_readers
+from zstate.net.discovery import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
 from zstate.net.sites import NO_SITES, Sites, discover_sites
 from zstate.net.status_monitor import StatusSubscriber
@@ -31,7 +31,7 @@ from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, WriterKey
 from zstate.nodes.clock import SimulatedClock
 from zstate.nodes.listener import Follow, TransformListener
-from zstate.plugins import edge_streams, is_latched, is_measured, measured_streams, stream_named
+from zstate.stream_registry import edge_streams, is_latched, is_measured, measured_streams, stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY

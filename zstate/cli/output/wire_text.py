@@ -12,7 +12,7 @@ from zstate.cli.output.console import count_text
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
-    from zstate.net.presence import RobotInfo
+    from zstate.net.discovery import RobotInfo
     from zstate.streams import StreamName
 
 
@@ -86,7 +86,7 @@ class NativeMessages:
     ) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
         streams = {written for info in robots if info.name == robot for written, _ in info.writers}
-        from zstate.plugins import find_stream
+        from zstate.stream_registry import find_stream
 
         if not streams:
             return self.unknown(robot, robots)

@@ -10,7 +10,7 @@ from zstate.cli.output.console import count_text
 from zstate.driving.driver_state import DriverStateListener, ReceivedState
 from zstate.driving.messages import DriverState
 from zstate.errors import format_duration
-from zstate.net.presence import RobotInfo
+from zstate.net.discovery import RobotInfo
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import ANY

@@ -25,7 +25,8 @@ from zstate.cli.options import load_robot
 from zstate.cli.output.console import count_text, fail, print_wrapped, report_text
 from zstate.cli.session import SessionOptions, open_session
 from zstate.cli.signals import SignalExit
-from zstate.errors import DriverFault, InvalidInput, MessageError, ZStateError, format_duration
+from zstate.driving.errors import DriverFault
+from zstate.errors import InvalidInput, MessageError, ZStateError, format_duration
 
 if TYPE_CHECKING:
     from zstate.driving import Driver, DriverHost, DriverReport, Limits

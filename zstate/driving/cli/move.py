@@ -17,15 +17,8 @@ from zstate.cli import options
 from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
 from zstate.driving.cli.drive import parse_joint_value
-from zstate.errors import (
-    InvalidInput,
-    MotionRefused,
-    MotionTimeout,
-    SecondWriter,
-    Unreachable,
-    ZStateError,
-    printable,
-)
+from zstate.driving.errors import MotionRefused, MotionTimeout
+from zstate.errors import InvalidInput, SecondWriter, Unreachable, ZStateError, printable
 
 if TYPE_CHECKING:
     from zstate.driving import Commander

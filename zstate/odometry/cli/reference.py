@@ -22,7 +22,8 @@ from zstate.errors import InvalidInput
 from zstate.odometry.messages import Odometry, Pose
 from zstate.odometry.source_noise import PoseNoise
 from zstate.wire.keys import check_writer
-from zstate.wire.messages import covariance_matrix, from_block
+from zstate.wire.measurements import covariance_matrix
+from zstate.wire.messages import from_block
 
 _LEAST_READINGS = 3
 _ITERATIONS = 20

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from zstate.recording.export import ExportReport, TableFormat
+    from zstate.recording.stores import OpenedPath
 
 _LINE_S = 2.0
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
@@ -88,6 +89,7 @@ def _read_stamps(file: str) -> NDArray[np.int64]:
     help="Default: RECORDING with the suffix of the format; with --stream .NAME before it.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
+@options.window_options
 def export_command(
     *,
     file: str,
@@ -103,6 +105,7 @@ def export_command(
     task: str | None,
     output: str | None,
     overwrite: bool,
+    window: tuple[int, int] | None,
 ) -> None:
     """Write the joint states of ROBOT in RECORDING, and poses of frames, as a table with one row for each
     instant.
@@ -118,6 +121,9 @@ def export_command(
     JSON; of ROBOT, by default of all robots. The package that brings the stream must be installed here.
     The default format is then --csv.
 
+    RECORDING may also be an archive, with ROBOT and a window; the default output is then ROBOT.csv and so
+    on.
+
     With --lerobot, rows are --fps a second: the joint positions interpolated at each instant, and the
     picture of each camera that is nearest to it. ROBOT is then the last argument that is no file.
     lerobot opens the folder DIR. Needs pip install 'zstate[cameras,export]'.
@@ -130,13 +136,14 @@ def export_command(
     zstate export run.mcap --stream cloud --parquet          # run.cloud.parquet, a row for each point
     zstate export run.mcap --stream cloud --ply              # run.cloud.ply/diffbot.lidar.STAMP.ply
     zstate export run.mcap --stream cloud --ply --frame map  # all of them in one frame
+    zstate export s3://plant/fleet robot17 --at 2026-11-20T14:03 --csv    # a minute of an archive
     zstate export ep1.mcap ep2.mcap --lerobot stack --task "stack the cubes"
     """
     if lerobot is not None:
-        if poses or rate is not None or stamps is not None or stream or frame or kind or output:
+        if poses or rate is not None or stamps is not None or stream or frame or kind or output or window:
             raise click.UsageError(
-                "--lerobot writes a folder of its own, without --pose, --rate, --stamps, --stream, --output "
-                "and the other formats"
+                "--lerobot writes a folder of its own, without --pose, --rate, --stamps, --stream, --output, "
+                "windows of archives and the other formats"
             )
         _export_lerobot((file, *rest), lerobot, fps or 30, task or "", overwrite=overwrite)
         return
@@ -144,13 +151,19 @@ def export_command(
         raise click.UsageError("--fps and --task are those of a dataset: name its folder with --lerobot DIR")
     if len(rest) > 1:
         raise click.UsageError(f"one RECORDING makes one file; got also {', '.join(rest[:-1])}")
+    from zstate.recording.errors import RecordingError
+    from zstate.recording.export import Exporter
+    from zstate.recording.recording import Recording
+    from zstate.recording.stores import opened_path
+
     robot = rest[0] if rest else None
     if stream is not None:
         if poses or rate is not None or stamps is not None:
             raise click.UsageError(
                 "--stream exports messages as recorded, without --pose, --rate and --stamps"
             )
-        _export_stream(file, robot, stream, kind or "csv", output, frame=frame, overwrite=overwrite)
+        with opened_path(file, robot, window) as opened:
+            _export_stream(opened, robot, stream, kind or "csv", output, frame=frame, overwrite=overwrite)
         return
     if frame is not None:
         raise click.UsageError("--frame places points: name their stream, such as --stream cloud")
@@ -160,13 +173,12 @@ def export_command(
         raise click.UsageError("--ply writes points: name their stream, such as --stream cloud")
     if rate is not None and stamps is not None:
         raise click.UsageError("--rate and --stamps exclude each other: both choose the rows")
-    from zstate.errors import RecordingError
-    from zstate.recording.export import Exporter
-    from zstate.recording.recording import Recording
-
-    path = Path(output) if output else Path(file).with_suffix(f".{kind}")
     start = time.monotonic()
-    with Recording(file, None if poses else robot) as recording:  # frames may be of other robots
+    with (
+        opened_path(file, robot, window) as opened,
+        Recording(opened.path, None if poses else robot) as recording,  # frames may be of other robots
+    ):
+        path = Path(output) if output else opened.named.with_suffix(f".{kind}")
         exporter = Exporter(
             recording, robot, rate_hz=rate, stamps=stamps, poses=poses, on_progress=ExportProgress()
         )
@@ -174,11 +186,11 @@ def export_command(
             report = exporter.write(path, kind, overwrite=overwrite)
         except RecordingError as error:
             fail(str(error).replace("overwrite=True", "--overwrite"))
-    print_wrapped(summary(report, path, time.monotonic() - start))
+        print_wrapped(summary(report, path, time.monotonic() - start))
 
 
 def _export_stream(
-    file: str,
+    opened: OpenedPath,
     robot: str | None,
     stream: str,
     kind: TableFormat | Literal["ply"],
@@ -187,13 +199,13 @@ def _export_stream(
     frame: str | None,
     overwrite: bool,
 ) -> None:
-    from zstate.errors import RecordingError
-    from zstate.plugins import stream_named
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recording import Recording
     from zstate.recording.stream_export import export_points, export_stream
+    from zstate.stream_registry import stream_named
 
-    path = Path(output) if output else Path(file).with_suffix(f".{stream}.{kind}")
-    with Recording(file, robot) as recording:
+    path = Path(output) if output else opened.named.with_suffix(f".{stream}.{kind}")
+    with Recording(opened.path, robot) as recording:
         try:
             if kind == "ply":
                 count, refused = export_points(recording, stream, path, frame=frame, overwrite=overwrite)
@@ -213,7 +225,7 @@ def _export_stream(
 
 
 def _export_lerobot(names: Sequence[str], folder: str, fps: int, task: str, *, overwrite: bool) -> None:
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.lerobot import export_lerobot
 
     *others, last = names

@@ -62,7 +62,7 @@ def plot_file(file: str) -> Path:
 @click.argument("robot", required=False)
 @click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
 @click.option("--path", "frames", nargs=2, metavar="A B", help="The path of frame B in frame A instead.")
-@click.option("--file", metavar="RECORDING", help="From a recording instead of live data.")
+@click.option("--file", metavar="RECORDING", help="From a recording, or a window of an archive.")
 @click.option("--start", type=options.SECONDS, help="Where to start in a recording [s]; default: 0.")
 @click.option(
     "--seconds", type=options.SECONDS, metavar="N", help="Duration [s]; default: 5, or the whole recording."
@@ -72,6 +72,7 @@ def plot_file(file: str) -> Path:
     type=options.Checked("FILE", plot_file),
     help="PNG, SVG or PDF; default: ROBOT.png or B.png.",
 )
+@options.window_options
 @options.placer_option
 @options.wire_option
 @options.session_options
@@ -85,6 +86,7 @@ def plot_command(
     start: float | None,
     seconds: float | None,
     output: Path | None,
+    window: tuple[int, int] | None,
     placers: tuple[str, ...] | None,
     wire: str,
 ) -> None:
@@ -98,23 +100,26 @@ def plot_command(
     zstate plot panda --joint panda_joint1 --seconds 20 --output joint1.svg
     zstate plot --path panda_link0 panda_hand          # panda_hand.png
     zstate plot --file run.mcap --start 60 --seconds 10
+    zstate plot robot17 --file s3://plant/fleet --at 2026-11-20T14:03    # a minute of an archive
     """
     new_figure("", 1.0)  # reports a missing Matplotlib before it collects data
     if joints and frames:
         raise click.UsageError("--joint and --path exclude each other: they are different plots")
-    if file is None and start is not None:
-        raise click.UsageError("--start needs --file RECORDING")
+    if file is None and (start is not None or window is not None):
+        raise click.UsageError("--start, --at, --from and --to need --file RECORDING")
     if placers is not None and (file is not None or not frames):
         raise click.UsageError("--placer is for --path A B of live robots")
     if file is not None:
         from zstate.recording.recording import Recording
+        from zstate.recording.stores import opened_path
 
         name, start_s = robot or Path(file).stem, start or 0.0
-        if frames:
-            with Recording(file, robot) as recording:
-                series = path_series(recording.buffer(), *frames, start_s=start_s, seconds=seconds)
-        else:
-            series = _recorded_joints(file, robot, start_s, seconds)
+        with opened_path(file, robot, window) as opened:
+            if frames:
+                with Recording(opened.path, robot) as recording:
+                    series = path_series(recording.buffer(), *frames, start_s=start_s, seconds=seconds)
+            else:
+                series = _recorded_joints(opened.path, robot, start_s, seconds)
     else:
         with open_session(network, (wire,)) as session:
             name = robot or messages_for(wire).robot or ("*" if frames else only_robot(session))
@@ -280,7 +285,7 @@ def _live_path(
         return path_series(listener.buffer, *frames)
 
 
-def _recorded_joints(path: str, robot: str | None, start_s: float, seconds: float | None) -> TimeSeries:
+def _recorded_joints(path: Path, robot: str | None, start_s: float, seconds: float | None) -> TimeSeries:
     """The joints of ``robot``, or of the only robot, in a recording. Raises RecordingError, InvalidInput."""
     from zstate.cli.output.joint_state_text import JointStateFormatter
     from zstate.recording.decode import (

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -29,8 +30,9 @@ from zstate.recording.cli.metrics import recorder_rows
 
 if TYPE_CHECKING:
     from zstate.clock import Clock
-    from zstate.errors import RecordingError
     from zstate.metrics.endpoint import BindAddress
+    from zstate.recording.background_store import BackgroundStore
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder, RecorderStats
     from zstate.recording.retention import FilePattern, Keep, Retention
 
@@ -81,6 +83,11 @@ def _parse_keep(text: str) -> Keep:
     help="Delete the oldest recordings that match FILE beyond this size, such as 50GB, or age, such as 7d, "
     "when a file starts.",
 )
+@click.option(
+    "--archive",
+    metavar="DIR|URL",
+    help="Add each finished file to this archive, in the background, before --keep deletes it.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing FILE.")
 @options.metrics_option
 @options.session_options
@@ -93,6 +100,7 @@ def record_command(
     split_size: float | None,
     split_seconds: float | None,
     keep: Keep | None,
+    archive: str | None,
     overwrite: bool,
     metrics: BindAddress | None,
     network: SessionOptions,
@@ -113,18 +121,24 @@ def record_command(
     a file of its own. --keep deletes files with such a name that zstate recorded, a split recording file by
     file, and never one that is being written.
 
+    --archive adds each finished file to an archive (`zstate archive`). A file that cannot be added is named
+    and tried again after the next one; the recording goes on. --keep deletes a file once it was tried.
+
     \b
     zstate record
     zstate record run.mcap
     zstate record run.mcap panda --seconds 60
     zstate record run.mcap --wire ros2:domain=5 --split-size 500
     zstate record rec-%Y%m%d-%H%M%S.mcap --split-size 500 --keep 50GB
+    zstate record rec-%Y%m%d-%H%M%S.mcap --split-seconds 600 --keep 7d --archive s3://plant/fleet
     """
-    from zstate.errors import RecordingError
+    from zstate.recording.background_store import BackgroundStore
+    from zstate.recording.errors import RecordingError
     from zstate.recording.recorder import Recorder
 
     pattern = _file_pattern(file)
     retention = None if keep is None else _retention(pattern, keep, split_size, split_seconds)
+    store = None if archive is None else BackgroundStore(archive)
     path = pattern.path_at(datetime.now())
     if str(path) != file:
         print_status(f"recording into {str(path)!r}")
@@ -146,18 +160,21 @@ def record_command(
             RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
             serve_metrics(metrics, recorder_rows(recorder), writer_rows(directory)),
         ):
-            progress = RecordProgress(recorder, directory, robots, retention)
+            progress = RecordProgress(recorder, directory, robots, retention, store)
             try:
                 _show(recorder, progress, seconds)
             finally:
                 recorder.close()
                 recorder.wait(_INDEX_WITHIN_S)  # the index of a large file takes its time on a busy machine
-                progress.watch_disk()
+                progress.watch_files()
+                progress.finish_store()
                 print_wrapped(progress.summary())
             if recorder.failure is not None:
                 raise recorder.failure
             if not recorder.stats.messages:
                 fail(f"nothing was recorded: {progress.no_message_text}")
+            if store is not None and store.failed:
+                fail(_missing_text(store))
 
 
 def _file_pattern(file: str) -> FilePattern:
@@ -198,6 +215,13 @@ def _retention(
     return Retention(pattern, keep, is_split=split_size is not None or split_seconds is not None)
 
 
+def _missing_text(store: BackgroundStore) -> str:
+    """What is missing in the archive, and how to add it."""
+    there = [str(file) for file in store.failed if file.exists()]
+    text = f"{count_text(len(store.failed), 'file')} of the recording not in {store.name}"
+    return f"{text}; add them by `zstate archive {store.name} --from {' '.join(there)}`" if there else text
+
+
 def _refusal_text(error: RecordingError, pattern: FilePattern) -> str:
     """Why the recording cannot start, in terms of the command line."""
     text = str(error).replace("overwrite=True", "--overwrite")
@@ -208,7 +232,7 @@ def _refusal_text(error: RecordingError, pattern: FilePattern) -> str:
 
 def _show(recorder: Recorder, progress: RecordProgress, seconds: float | None) -> None:
     """Show progress until the recording has ended, or for ``seconds``."""
-    progress.watch_disk()
+    progress.watch_files()
     until = math.inf if seconds is None else time.monotonic() + seconds
 
     def is_over(pause_s: float) -> bool:
@@ -216,7 +240,7 @@ def _show(recorder: Recorder, progress: RecordProgress, seconds: float | None) -
 
     if not is_terminal():
         while not is_over(_LINE_S):
-            progress.watch_disk()
+            progress.watch_files()
             for change in progress.changes():
                 print_status(change)
             print_wrapped(progress.line())
@@ -226,7 +250,7 @@ def _show(recorder: Recorder, progress: RecordProgress, seconds: float | None) -
 
     with Live(auto_refresh=False, transient=True) as live:
         while not is_over(_REFRESH_S):
-            progress.watch_disk()
+            progress.watch_files()
             for change in progress.changes():
                 live.console.print(change, markup=False, highlight=False, soft_wrap=True)
             live.update(Text(progress.line()), refresh=True)
@@ -241,11 +265,14 @@ class RecordProgress:
         directory: RobotDirectory,
         robots: Sequence[str],
         retention: Retention | None = None,
+        store: BackgroundStore | None = None,
     ) -> None:
         from zstate.clock import MonotonicClock
 
         self._recorder, self._directory, self._robots = recorder, directory, robots
         self._retention, self._retained_at = retention, 0
+        self._store, self._stored = store, 0
+        self._reported: dict[Path, str] = {}
         self._disk = DiskForecast(lambda: recorder.stats, retention, MonotonicClock())
         self._listed: set[tuple[str, str]] = set()
         self._waiting = ""
@@ -274,18 +301,51 @@ class RecordProgress:
             yield f"waiting: {waiting}"
             self._waiting = waiting
 
-    def watch_disk(self) -> None:
-        """Delete recordings beyond ``--keep`` if a file has started since, and warn of a disk that fills."""
+    def watch_files(self) -> None:
+        """Add finished files to ``--archive``, delete those beyond ``--keep``, warn of a disk that fills."""
         files = self._recorder.stats.files
+        self._watch_store(files[: len(files) if self._recorder.wait(0.0) else -1])
         if self._retention is not None and len(files) != self._retained_at:
             self._retained_at = len(files)
             kept = self._retention.keep.text
-            for file in self._retention.delete_excess(files[-1]):
+            waiting = () if self._store is None else self._store.waiting
+            for file in self._retention.delete_excess({files[-1], *waiting}):
                 text = f"deleted {str(file.path)!r} ({size_text(file.size)}): --keep {kept}"
                 print_status(text, event="deleted")
         warning = self._disk.warning()
         if warning:
             print_status(warning, event="disk", level="warning")
+
+    def _watch_store(self, finished: Sequence[Path]) -> None:
+        store = self._store
+        if store is None:
+            return
+        for file in finished[self._stored :]:
+            store.add(file)
+        self._stored = len(finished)
+        self._report_store(store)
+
+    def _report_store(self, store: BackgroundStore) -> None:
+        """Print why the store cannot be used, and what it does not have."""
+        if store.problem:
+            print_status(f"--archive {store.name}: {store.problem}", event="archive", level="warning")
+            store.problem = ""
+        for file, reason in list(store.failed.items()):
+            if self._reported.get(file) != reason:
+                text = f"{str(file)!r} is not in {store.name}: {reason}"
+                print_status(text, event="archive", level="warning")
+                self._reported[file] = reason
+
+    def finish_store(self) -> None:
+        """Wait until ``--archive`` has the last files. Ctrl-C ends the wait."""
+        store = self._store
+        if store is None:
+            return
+        if not store.finish(_LINE_S):
+            print_status(f"adding the last files to {store.name}; Ctrl-C leaves them out")
+            while not store.finish(_LINE_S):
+                pass
+        self._report_store(store)
 
     @property
     def no_message_text(self) -> str:
@@ -306,7 +366,15 @@ class RecordProgress:
         robots = f" of {', '.join(_robots(stats))}" if _robots(stats) else ""
         where = f"{files_text(stats.files)} ({size_text(stats.bytes)})"
         lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
-        return f"recorded {messages}{robots} in {took:.1f} s into {where}; {lost}{self._deleted()}"
+        text = f"recorded {messages}{robots} in {took:.1f} s into {where}; {lost}"
+        return f"{text}{self._deleted()}{self._archived()}"
+
+    def _archived(self) -> str:
+        store = self._store
+        if store is None:
+            return ""
+        failed = f", {len(store.failed)} not" if store.failed else ""
+        return f"; added {count_text(len(store.added), 'file')} to {store.name}{failed}"
 
     def _deleted(self) -> str:
         if self._retention is None or not self._retention.deleted_files:

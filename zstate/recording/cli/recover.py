@@ -19,7 +19,7 @@ def recover_command(file: str, target: str | None, overwrite: bool) -> None:
     For a FILE that is damaged, or cut off by a crash or a full disk; it is not changed. TARGET is
     FILE_recovered.mcap by default. Recover each file of a split recording by itself.
     """
-    from zstate.errors import RecordingError
+    from zstate.recording.errors import RecordingError
     from zstate.recording.mcap.recover import recover
 
     source = Path(file)

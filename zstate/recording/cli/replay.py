@@ -140,7 +140,7 @@ def _show(player: Player, call: BackgroundCall[PlayerReport]) -> PlayerReport:
 
 def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
     """Writers on the network of streams that a replay of ``robots`` would publish."""
-    from zstate.net.presence import discover
+    from zstate.net.discovery import discover
     from zstate.recording.decode import further_streams
     from zstate.streams import JOINT_STREAMS
     from zstate.wire.registry import get_wire

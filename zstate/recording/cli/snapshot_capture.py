@@ -17,8 +17,9 @@ from zstate.cli.session import SessionOptions
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, JointType, RobotModel
+from zstate.net.discovery import RobotInfo, discover
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import RobotInfo, announce_reader, discover
+from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.recording.cli.snapshot_file import (

@@ -17,7 +17,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.index import DataRange, FileScan, Summary, read_header
 from zstate.recording.mcap.records import MAGIC, MESSAGE, BoundedFile, CorruptData, iter_records, parse_record
 from zstate.recording.storage import Channel, Format, ReadFilter, Record, SortedPart

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from zstate.errors import RecordingError
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.file import explain_unreadable, open_errors
 from zstate.recording.mcap.index import DataLoss, FileScan
 from zstate.recording.mcap.records import MESSAGE, BoundedFile, iter_records

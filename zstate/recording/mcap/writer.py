@@ -18,7 +18,8 @@ from mcap.writer import CompressionType, Writer
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.errors import InvalidInput, RecordingError
+from zstate.errors import InvalidInput
+from zstate.recording.errors import RecordingError
 from zstate.recording.mcap.file import IDENTITY, MISSING, later_splits, split_path
 from zstate.recording.storage import ChannelType
 from zstate.wire.ros2.qos import Qos

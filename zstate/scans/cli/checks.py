@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from zstate.cli.doctor.check import Check, broken, ok
 from zstate.cli.doctor.plugin_checks import PluginChecks, ProbedRobot
-from zstate.net.presence import RobotInfo
+from zstate.net.discovery import RobotInfo
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.scans.messages import OccupancyGrid

@@ -91,6 +91,13 @@ class RosDecoder:
         states = self._joints.decode_many(payloads)
         return states if states is not None and states.stamps.all() else None
 
+    def edges(self, payloads: Sequence[bytes]) -> Edges | None:
+        """The edges of transforms, by their names in ROS, in ``payloads``, of one length and channel.
+
+        None unless they differ only in numbers and all have a stamp: ``messages`` then decodes each.
+        """
+        return self._edges.edges_of(payloads)
+
     def _transform_samples(
         self, payload: bytes, session: int, seq: int, names: FrameNames
     ) -> tuple[TransformSample, ...]:
@@ -270,6 +277,20 @@ class TfMessageDecoder:
             return RosTransforms(None, unpack_stamps(times), edges, poses)
         (stamp,) = unpack_stamps(first)
         return RosTransforms(stamp, (stamp,) * count, edges, poses)
+
+    def edges_of(self, payloads: Sequence[bytes]) -> Edges | None:
+        """The edges of ``payloads``, of one length; None unless they differ only in numbers, with stamps."""
+        try:
+            self.decode(payloads[0])  # adds its template
+        except MessageError:
+            return None
+        found = self._templates.find_many(payloads)
+        if found is None:
+            return None
+        edges, numbers = found
+        times = numbers[:, : _STAMP_WORDS * len(edges)].reshape(len(payloads), len(edges), _STAMP_WORDS)
+        is_valid = times.any(axis=2) & (times[:, :, 1] < SECOND_NS)
+        return edges if is_valid.all() else None
 
 
 def read_tf_message(reader: CdrReader) -> RosTransforms:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from zstate.errors import InvalidInput
 from zstate.message import Message
-from zstate.plugins import own_streams
+from zstate.stream_registry import own_streams
 from zstate.streams import StreamName
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType

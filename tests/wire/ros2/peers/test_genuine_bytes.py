@@ -29,7 +29,8 @@ from ros_messages import (
 from zstate.scans.messages import LaserScan, OccupancyGrid
 from zstate.streams import StreamName
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.messages import Message, to_block, to_float32_block
+from zstate.wire.measurements import to_float32_block
+from zstate.wire.messages import Message, to_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
 from zstate.wire.ros2.decoder import JointStateDecoder, RosDecoder, TfMessageDecoder

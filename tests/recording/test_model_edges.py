@@ -6,7 +6,7 @@ import numpy as np
 from helpers.recording_builder import START, pose
 from helpers.robots import RRBOT
 
-from zstate.ingest.transforms import ModelEdgeFilter
+from zstate.recording.model_edges import ModelEdgeFilter
 from zstate.wire.messages import (
     Edges,
     StaticTransforms,
