@@ -10,7 +10,7 @@ from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, SampleCollector
 
 from zstate import StatePublisher, connect, discover
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, ZStateError
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.router_config import RouterConfig
 from zstate.fleet.uplink import Uplink
@@ -70,3 +70,31 @@ def test_a_rogue_site_cannot_write_the_robots_of_another_nor_pose_as_it(tmp_path
 def test_two_sites_with_one_robot_are_refused():
     with pytest.raises(InvalidInput, match="'r1' is given to the sites 'plant1' and 'plant2'"):
         AclRoles(sites={"plant1": ("r1",), "plant2": ("r1",)})
+
+
+def test_a_site_whose_authority_headquarters_no_longer_accepts_is_refused(tmp_path: Path):
+    """Each site has an authority of its own; Zenoh reads no revocation lists."""
+    for name in ("hq", *ROBOTS):
+        (tmp_path / name).mkdir()
+        certificates.issue_identities(tmp_path / name, [name])
+    headquarters = f"tls/127.0.0.1:{find_free_port()}"
+    access = access_control(AclRoles(sites=ROBOTS))
+
+    def identity(name: str, *authorities: str) -> Credentials:
+        folder, bundle = tmp_path / name, tmp_path / name / "accepted.pem"
+        bundle.write_text("".join((tmp_path / one / "ca.pem").read_text() for one in authorities))
+        return Credentials(ca=bundle, certificate=folder / f"{name}.pem", key=folder / f"{name}.key")
+
+    def joins(site: str) -> bool:
+        try:
+            with connect(mode="client", endpoints=headquarters, credentials=identity(site, "hq")):
+                return True
+        except ZStateError:
+            return False
+
+    for accepted in (("plant1", "plant2"), ("plant1",)):
+        config = RouterConfig(
+            (headquarters,), credentials=identity("hq", "hq", *accepted), access_control=access
+        )
+        with connect(config.settings()):
+            assert {site: joins(site) for site in ROBOTS} == {site: site in accepted for site in ROBOTS}

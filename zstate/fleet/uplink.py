@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from zstate.errors import ConfigError, InvalidInput
 from zstate.fleet.acl import ALL_KEYS, MESSAGES, Rule, check_namespace
 from zstate.fleet.downsampling import check_rates, rate_rules
+from zstate.net.sites import UPLINK_OF
 from zstate.stream_registry import all_streams
 from zstate.streams import StreamName
 from zstate.wire.keys import ANY, RELEASE, STATUS, check_robot, stream_expression
@@ -88,20 +89,20 @@ class Uplink:
         distinguished from them.
         """
         link = self._link(others)
-        uplink = {**link, "flows": ["egress"]}
+        uplink = {"id": f"{UPLINK_OF}{self.site}", **link, "flows": ["egress"]}
         thinned = {stream: self.rates_hz[stream] / _EARLY for stream in self.passing}
         rules = rate_rules(thinned, self.robots, self.namespace)
         keys = ["**", "**/@adv/**"]
         overwrite = {"key_exprs": keys, "overwrite": {"congestion_control": "drop"}}
         settings: dict[str, object] = {
-            "qos/network": [{"id": "uplink", **uplink, "messages": ["put"], **overwrite}],
+            "qos/network": [{**uplink, "messages": ["put"], **overwrite}],
             "access_control": self._access_control(link, access),
         }
         if rules:
-            settings["downsampling"] = [{"id": "uplink", **uplink, "messages": ["put"], "rules": rules}]
+            settings["downsampling"] = [{**uplink, "messages": ["put"], "rules": rules}]
         if self.largest_bytes is not None:
             of = {"messages": ["put", "reply"], "key_exprs": [*self._measured()]}
-            settings["low_pass_filter"] = [{"id": "uplink", **uplink, **of, "size_limit": self.largest_bytes}]
+            settings["low_pass_filter"] = [{**uplink, **of, "size_limit": self.largest_bytes}]
         return settings
 
     def _access_control(self, link: _Link, access: Mapping[str, object]) -> dict[str, object]:

@@ -27,6 +27,9 @@ _TOKEN_LENGTH = 4000
 """The length of the names in one token. Keys may be longer, but each router keeps them."""
 
 
+UPLINK_OF = "uplink of "
+"""What the names of the rules of an uplink begin with, before that of the site."""
+
 _MOST = 1.25
 """The largest ratio of a measured to the thinned rate."""
 

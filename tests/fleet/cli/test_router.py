@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -224,6 +225,15 @@ def test_a_site_prints_what_passes_and_runs_it(free_port: int, tmp_path: Path):
     assert [one["key_expr"] for one in rules] == [f"zstate/r{n}/joint_states" for n in (1, 2)]
     limited = run_cli(*arguments, "--largest", "64", "--print").stdout
     assert "size_limit: 64000" in limited
+    (tmp_path / "router.json5").write_text(limited)
+    shown = run_cli("config", "--config", str(tmp_path / "router.json5")).stdout
+    assert re.search(r"^site +plant1 ", shown, re.MULTILINE)
+    assert re.search(r"^uplink +tcp ", shown, re.MULTILINE)
+    assert re.search(
+        r"^passing +joint_states at most 5.21 Hz of 2 robots, nothing larger than 64000 B ",
+        shown,
+        re.MULTILINE,
+    )
 
 
 @pytest.mark.parametrize(

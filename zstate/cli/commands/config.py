@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, cast
@@ -19,7 +19,7 @@ from click.core import ParameterSource
 from zstate._util.format import did_you_mean
 from zstate.cli import options
 from zstate.cli.options import PASSWORD_VARIABLE, build_credentials, build_network
-from zstate.cli.output.console import print_json, print_result, print_status, print_wrapped
+from zstate.cli.output.console import count_text, print_json, print_result, print_status, print_wrapped
 from zstate.cli.output.logs import FORMAT_VARIABLE, FORMATS
 from zstate.cli.output.text_layout import in_columns
 from zstate.cli.output.wire_text import is_ros
@@ -82,7 +82,8 @@ class Setting:
         """The value as displayed: "-" for none, a list separated by blanks."""
         value: object = self.value
         if isinstance(value, list):
-            return " ".join(map(str, cast("list[object]", value))) or "-"
+            between = ", " if self.name == "passing" else " "
+            return between.join(map(str, cast("list[object]", value))) or "-"
         return "-" if value is None else str(value)
 
 
@@ -187,6 +188,32 @@ def _file_settings(context: click.Context, file: str) -> Iterator[Setting]:
         if isinstance(value, dict):  # one value for each mode
             value = cast("dict[str, Any]", value).get(mode)
         yield Setting(option.name, value, option.origin if is_used else from_file)
+    yield from _site_settings(json.loads(str(config)), f"file {file}")
+
+
+def _site_settings(config: Mapping[str, Any], origin: str) -> Iterator[Setting]:
+    """The site whose router has this configuration, and what its uplink passes."""
+    from zstate.net.sites import UPLINK_OF
+
+    def of_uplink(section: Iterable[dict[str, Any]] | None) -> Iterator[dict[str, Any]]:
+        return (one for one in section or () if str(one["id"]).startswith(UPLINK_OF))
+
+    for uplink in of_uplink(config["qos"]["network"]):
+        yield Setting("site", uplink["id"].removeprefix(UPLINK_OF), origin)
+        yield Setting("uplink", uplink["interfaces"] or uplink["link_protocols"], origin)
+        robots: dict[tuple[str, float], int] = {}
+        for item in of_uplink(config["downsampling"]):
+            for rule in item["rules"]:
+                stream = rule["key_expr"].removesuffix("/*").rpartition("/")[2], rule["freq"]
+                robots[stream] = robots.get(stream, 0) + 1
+        passing = [
+            f"{stream} at most {rate_hz:.3g} Hz of {count_text(count, 'robot')}"
+            for (stream, rate_hz), count in robots.items()
+        ]
+        passing += [
+            f"nothing larger than {item['size_limit']} B" for item in of_uplink(config["low_pass_filter"])
+        ]
+        yield Setting("passing", passing or ["no sample"], origin)
 
 
 def _zenoh_settings(context: click.Context) -> dict[str, Any]:
