@@ -43,6 +43,7 @@ def test_reader_without_diagnostics_inserts_what_a_listener_inserts(sessions, fo
             publisher.publish([0.01 * step, -0.02 * step], stamp=STAMP + step * MS)
         for count in (counters.stats, lambda: listener.stats):
             until(lambda count=count: count().received == 20)
+        until(lambda: buffer.can_lookup("world", "tool", STAMP + 19 * MS))  # static edges come by themselves
         assert alone.ingests.robots() == listener.robots() == ("r1",)
     for step in range(20):
         stamp = STAMP + step * MS

@@ -129,7 +129,9 @@ def test_mistakes_are_reported(tmp_path: Path):
     needs_matplotlib()
     assert ".png, .svg, .pdf" in failure("plot", "rrbot", "--output", "plot.jpg", code=2)
     assert "they are different plots" in failure("plot", "--joint", "a", "--path", "a", "b", code=2)
-    assert "--start needs --file RECORDING" in failure("plot", "rrbot", "--start", "1", code=2)
+    assert "--start, --at, --from and --to need --file RECORDING" in failure(
+        "plot", "rrbot", "--start", "1", code=2
+    )
     assert "a duration is" in failure("plot", "--file", "x.mcap", "--start", "nan", code=2)
     assert "no robot is announced" in failure("plot")
     with published_robot("left"), published_robot("right"):
