@@ -89,9 +89,10 @@ write_point(Placing *placing, Py_ssize_t i, const double p[3])
 }
 
 /* A lidar with several beams repeats its stamps for each of them. Their poses are kept, each in one
- * of the two slots that its stamp selects, until another stamp needs the slot. Slots are selected by
- * multiplicative hashing (Knuth, TAOCP 6.4), which spreads stamps at a constant rate evenly; those of
- * a real sensor vary by microseconds, and one slot each would be shared by a fifth of 1024. */
+ * of the two slots that its stamp selects, until another stamp needs the slot. Slots are selected
+ * by multiplicative hashing (Knuth, TAOCP 6.4), which spreads stamps at a constant rate evenly;
+ * those of a real sensor vary by microseconds, and one slot each would be shared by a fifth of
+ * 1024. */
 #define SLOT_BITS 12
 #define SLOTS (1 << SLOT_BITS)
 
@@ -117,8 +118,8 @@ are_repeated(const int64_t *stamps, Py_ssize_t count)
     return repeated > count - count / 3;
 }
 
-/* The slot with the pose of an instant, or the one for it: the first of its two, unless only the second
- * is free. */
+/* The slot with the pose of an instant, or the one for it: the first of its two, unless only the
+ * second is free. */
 static inline KeptPose *
 find_slot(KeptPose *kept, int64_t at)
 {
