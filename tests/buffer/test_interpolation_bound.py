@@ -14,7 +14,6 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 
 PERIOD_NS = SECOND // 5
-MODELS = {name: load_model(name) for name in ("panda", "gripper")}
 
 
 def random_motion(model: RobotModel, seed: int, ticks: int) -> np.ndarray:
@@ -25,10 +24,10 @@ def random_motion(model: RobotModel, seed: int, ticks: int) -> np.ndarray:
     return np.cumsum(steps, axis=0)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", ["gripper", pytest.param("panda", marks=pytest.mark.robots)])
 @pytest.mark.parametrize("seed", range(5))
 def test_no_motion_within_the_limits_is_farther_from_an_interpolated_pose(name: str, seed: int):
-    model = MODELS[name]
+    model = load_model(name)
     motion, buffer = random_motion(model, seed, 51), TransformBuffer()
     track = buffer.add_robot(model)
     for tick in range(0, 51, 10):
@@ -45,8 +44,9 @@ def test_no_motion_within_the_limits_is_farther_from_an_interpolated_pose(name: 
         assert (bound.translation == 0.0) == (tick % 10 == 0)
 
 
+@pytest.mark.robots
 def test_a_joint_at_rest_may_have_gone_half_the_interval_at_its_limit_and_back():
-    model = MODELS["panda"]
+    model = load_model("panda")
     buffer = TransformBuffer()
     track = buffer.add_robot(model)
     for tick in (0, 1):

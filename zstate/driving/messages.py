@@ -175,7 +175,9 @@ class Stop(StampedMessage, frozen=True, array_like=True, gc=False):
         encoded = bytes(head.reason)
         try:
             _TEXT_DECODER.decode(encoded)
-        except UnicodeDecodeError:
+        except msgspec.ValidationError:  # it is no text
+            raise
+        except (UnicodeDecodeError, msgspec.DecodeError):  # the latter since msgspec 0.23
             reason = encoded[_TEXT_HEADERS.get(encoded[0], 1) :].decode("utf-8", "replace")
             return msgspec.msgpack.encode((head.stamp, head.seq, head.session, head.how, reason))
         return payload
