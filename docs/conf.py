@@ -155,7 +155,9 @@ def _shorten_signature(*event: Any) -> tuple[str, str] | None:
         fields = getattr(given, "__struct_fields__", ())  # of messages
         arguments = f"({', '.join(fields)})" if fields else ""
     texts = (re.sub(_ARRAY, r"NDArray[\1]", text or "") for text in (arguments, result))
-    return next(texts), next(texts)
+    # With a class that the module imports for types alone, annotations are as they are written.
+    arguments, result = (re.sub(r"\bnp\.(\w+?)_?\b", r"~numpy.\1", text) for text in texts)
+    return arguments, result
 
 
 def setup(app: Sphinx) -> None:

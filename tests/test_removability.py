@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.processes import DEADLINE_S
+from helpers.processes import DEADLINE_S, find_free_port
 
 from zstate.plugins import built_in_plugins
 
@@ -31,11 +31,11 @@ for name in modules_of(zstate):
     import_module(name)
 for name in [name for name in sys.modules if name.partition(".")[0] == "zstate"]:
     del sys.modules[name]
-folders = sys.argv[1:]
+folders = dict(name.split("=") for name in sys.argv[1:])
 running = 0
 while folders or running:
     if folders and running < 4:  # they wait more than they compute
-        folder = folders.pop()
+        folder, os.environ["ZSTATE_RENDEZVOUS"] = folders.popitem()
         if not os.fork():
             break
         running += 1
@@ -89,7 +89,7 @@ print("\\n" + json.dumps(found))
 @pytest.mark.processes
 def test_without_a_folder_the_rest_starts_and_shows_a_robot(tmp_path: Path):
     ended = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *PLUGINS],
+        [sys.executable, "-c", PROGRAM, *(f"{folder}=127.0.0.1:{find_free_port()}" for folder in PLUGINS)],
         capture_output=True,
         text=True,
         timeout=len(PLUGINS) * 8 * DEADLINE_S,

@@ -106,7 +106,7 @@ def test_sql_shows_nothing_of_an_import_that_is_not_complete(tmp_path: Path, rec
         assert [connection.sql(query).fetchall() for query in queries] == counts
     import_recording(url, tmp_path / "later.mcap")
     with Archive(url).duckdb() as connection:
-        assert connection.sql(queries[0]).fetchone()[0] == counts[0][0][0] + 50
+        assert connection.sql(queries[0]).fetchall()[0][0] == counts[0][0][0] + 50
 
 
 def test_an_import_that_is_killed_leaves_the_archive_as_it_was(tmp_path: Path, recording: Path):
