@@ -46,7 +46,7 @@ class _Tf2Method:
 def with_tf2_methods(cls: type[_Class]) -> type[_Class]:
     """``cls``, whose missing methods of tf2_ros.Buffer raise an error with the name here.
 
-    A ``__getattr__`` says the same, but makes Python 3.11 find every other attribute more slowly.
+    A ``__getattr__`` raises the same error, but makes Python 3.11 find every other attribute more slowly.
     """
     for name in TF2_METHODS:
         camel = re.sub(r"_(.)", lambda match: match[1].upper(), name)

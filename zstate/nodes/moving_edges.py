@@ -77,7 +77,7 @@ class MovingEdgesOnDemand:
 
 
 def _load_pinocchio_in_steps() -> None:
-    """Load Pinocchio in the background: other threads run meanwhile, except for some milliseconds a module.
+    """Load Pinocchio in the background: other threads run, except for some milliseconds a module.
 
     An import of it holds the interpreter until all of its libraries are loaded. Here the loader of the system
     maps them without the interpreter, which the three modules then hold one by one. What cannot be loaded is
