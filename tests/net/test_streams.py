@@ -187,6 +187,33 @@ def test_close_does_not_wait_for_a_reader_that_is_busy(sessions):
         assert went_on == [True], "it was closed before the reader gave up waiting"
 
 
+@pytest.mark.parametrize("keys", [KEY, (KEY, "zstate/q/joint_states")], ids=["a ring", "several keys"])
+def test_a_subscriber_that_finishes_delivers_what_has_arrived(sessions, keys: str | tuple[str, ...]):
+    busy, go_on = threading.Event(), threading.Event()
+    got: list[bytes] = []
+
+    def hold(samples: list[SerializedSample]) -> None:
+        got.extend(sample.payload for sample in samples)
+        busy.set()
+        go_on.wait(DEADLINE_S)
+
+    with (
+        KeyPublisher(sessions[0], KEY, ENCODING) as publisher,
+        StreamSubscriber(sessions[0], keys, hold) as slow,
+    ):
+        until(lambda: publisher.has_readers)
+        publisher.put(b"1")
+        assert busy.wait(DEADLINE_S)
+        for payload in (b"2", b"3"):  # of this session, so they have arrived
+            publisher.put(payload)
+        finishing = threading.Thread(target=slow.finish, args=(DEADLINE_S,))
+        finishing.start()
+        until(lambda: not publisher.has_readers)
+        go_on.set()
+        finishing.join(DEADLINE_S)
+        assert got == [b"1", b"2", b"3"]
+
+
 def test_a_closed_session_ends_the_threads_of_its_subscribers():
     session = connect()
     subscriber = StreamSubscriber(session, KEY, lambda samples: None)

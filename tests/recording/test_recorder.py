@@ -406,6 +406,16 @@ RECORDER = """
 """
 
 
+def test_a_recorder_that_is_closed_at_once_writes_all_that_has_arrived(sessions, tmp_path: Path):
+    number = 1000
+    with StatePublisher(sessions[0], RRBOT) as publisher:
+        with Recorder(sessions[0], tmp_path / "run.mcap", ["rrbot"]) as recorder:
+            for step in range(number):
+                publisher.publish([0.0, 0.0], stamp=STAMP + step * PERIOD)
+        assert count(recorder, "rrbot") == number
+    assert len(read(tmp_path / "run.mcap", "/joint_states")) == number
+
+
 def test_killed_recorder_loses_at_most_the_last_half_second(sessions, spawn, tmp_path: Path):
     from zstate.recording.mcap.recover import recover
 

@@ -103,6 +103,7 @@ class Receiver(Closeable):
         self._capacity = capacity
         self._closed = False
         self._waiting: deque[zenoh.Sample] = deque(maxlen=capacity)
+        self._ring: zenoh.handlers.Handler[zenoh.Sample] | None = None
         self._has_turn = False
         self._subscribers: list[Undeclarable] = []
         self._is_shared = thread is not None
@@ -113,6 +114,7 @@ class Receiver(Closeable):
             else:
                 subscriber = declare(keyexprs[0], zenoh.handlers.RingChannel(capacity))
                 self._subscribers.append(subscriber)
+                self._ring = subscriber.handler
                 drain = partial(self._drain, subscriber.handler)
                 if is_dormant:
                     self._subscribe(keyexprs, declare, lambda _: self._give_turn(drain))
@@ -127,6 +129,21 @@ class Receiver(Closeable):
 
     def _is_handled(self, sample: zenoh.Sample) -> bool:
         return False
+
+    def finish(self, timeout_s: float) -> None:
+        """Unsubscribe, and wait at most ``timeout_s`` [s] until all that has arrived is delivered.
+
+        For readers that must not lose it: ``close`` drops what waits. Not from inside a callback.
+        """
+        with suppress(zenoh.ZError):  # of a session that is closed
+            while self._ring is not None and (sample := self._ring.try_recv()) is not None:
+                self._waiting.append(sample)  # a ring is gone once its subscriber is
+        for subscriber in self._subscribers:
+            self._session.release(subscriber)
+        self._thread.call(self._take_turn)
+        delivered = threading.Event()
+        self._thread.call(delivered.set)
+        delivered.wait(timeout_s)
 
     def close(self) -> None:
         """Stop within a second, also from inside a callback, which is not called afterwards.

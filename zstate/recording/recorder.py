@@ -25,7 +25,7 @@ from zstate.net.at_exit import forked_text
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
-from zstate.net.streams import StreamSubscriber, capacity_for
+from zstate.net.streams import Receiver, StreamSubscriber, capacity_for
 from zstate.rate import Rate
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.errors import RecordingError
@@ -64,9 +64,10 @@ _LARGE_WAITING_BYTES = 1 << 26
 _WRITES_HZ = 20.0
 # Robots that start together should be discovered together: it decides their namespaces in the file.
 _DISCOVERY_NS = 300_000_000
-# Closing takes a second at most, subscriptions included.
-_DRAIN_S = 0.5
-_JOIN_WITHIN_S = 0.9
+# What was received is written in milliseconds, but on a machine that is busy or a disk that is slow. From
+# then on the rest is dropped; a disk that never answers keeps no program from its end.
+_DRAIN_S = 5.0
+_CLOSED_WITHIN_S = 8.0
 
 
 class Batch(NamedTuple):
@@ -96,7 +97,7 @@ class MessageQueue(Closeable):
         self._waiting = self._bytes = 0
         self._has_room = fork_safe(threading.Condition())
         self._is_open = True
-        self._subscribers: dict[StreamName, Closeable] = {}
+        self._subscribers: dict[StreamName, Receiver] = {}
 
     def subscribe(self, stream: StreamName, expressions: Sequence[str], robot: str | None) -> None:
         """Subscribe to a stream, in place of the last subscription to it.
@@ -140,6 +141,12 @@ class MessageQueue(Closeable):
             self._waiting = self._bytes = 0
             self._has_room.notify_all()
         return batches
+
+    def finish(self, timeout_s: float) -> None:
+        """Unsubscribe once all that has arrived is in the queue, or after ``timeout_s`` [s]."""
+        deadline = time.monotonic() + timeout_s
+        for subscriber in list(self._subscribers.values()):
+            subscriber.finish(max(0.0, deadline - time.monotonic()))
 
     def close(self) -> None:
         """Unsubscribe, within a second; what is in the queue can still be read."""
@@ -342,12 +349,18 @@ class Recorder(Closeable):
         return wait_interruptible(self._ended, timeout_s)
 
     def close(self) -> None:
-        """End the recording within a second: write what was received, and finish the file."""
+        """End the recording: write what was received, and finish the file.
+
+        What is not written within 5 s is dropped and counted; a disk that does not answer is left after 8 s.
+        """
         atexit.unregister(self.close)
+        began = time.monotonic()
+        self._ends_at = min(self._ends_at, began + _DRAIN_S)
+        if os.getpid() == self._pid and not self._ended.is_set():
+            self._queue.finish(_DRAIN_S)
         self._unsubscribe()
-        self._ends_at = min(self._ends_at, time.monotonic() + _DRAIN_S)
         self._stop.set()
-        self._thread.join(_JOIN_WITHIN_S)
+        self._thread.join(max(0.0, began + _CLOSED_WITHIN_S - time.monotonic()))
 
     def _unsubscribe(self) -> None:
         with self._closing:

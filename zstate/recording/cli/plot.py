@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from zstate.cli.output.console import count_text, fail, print_status, print_wrap
 from zstate.cli.output.wire_text import default_stream, messages_for
 from zstate.cli.robot_directory import RobotDirectory, only_robot
 from zstate.cli.session import SessionOptions, open_session
+from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing
 
 if TYPE_CHECKING:
@@ -281,7 +283,7 @@ def _live_path(
     ):
         PoseWaiter(listener, directory, *frames).wait(timeout_s=_WAIT_S)
         print_status(f"listening for {seconds:g} s ...")
-        time.sleep(seconds)
+        wait_interruptible(threading.Event(), seconds)
         return path_series(listener.buffer, *frames)
 
 
