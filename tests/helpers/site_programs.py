@@ -129,10 +129,11 @@ def headquarters(endpoint: str, certs: str, names: str) -> None:
         )
 
 
-def counter(endpoint: str) -> None:
-    """Counts what arrives of a flood."""
+def counter(endpoint: str, certs: str = "") -> None:
+    """Counts what arrives of a flood, as the identity "desk" if there are certificates."""
     arrived: list[int] = []
-    with connect(mode="client", endpoints=endpoint) as session:
+    credentials = Credentials.from_folder(certs, "desk") if certs else None
+    with connect(mode="client", endpoints=endpoint, credentials=credentials) as session:
         session.zenoh.declare_subscriber("zstate/r1/status/*", lambda _: arrived.append(1))
         serve(arrived=lambda: len(arrived))
 

@@ -33,10 +33,12 @@ from zstate.net.config import (
     listen_endpoints,
     scouts_by_multicast,
 )
+from zstate.net.dead_links import limit_dead_links
 from zstate.net.open import open_with_retry
 
 if TYPE_CHECKING:
     from zstate.net.connection_monitor import ConnectionMonitor
+    from zstate.net.dead_links import LinkListener
     from zstate.net.rendezvous import Rendezvous
     from zstate.net.security.credentials import Credentials
     from zstate.net.security.probe import ProbeSession
@@ -163,7 +165,7 @@ def _session(
         from zstate.net.security.probe import ProbeSession  # noqa: PLC0415 - as above
 
         probe = ProbeSession.for_config(config, credentials)
-    return Session(raw, monitor, probe=probe)
+    return Session(raw, monitor, probe=probe, limited=limit_dead_links(raw, config))
 
 
 def _connection_monitor(
@@ -217,8 +219,10 @@ class Session(Closeable):
         companion: Rendezvous | ConnectionMonitor | None = None,
         *,
         probe: ProbeSession | None = None,
+        limited: LinkListener | None = None,
     ) -> None:
         self._raw = raw
+        self._limited_links = limited
         self._companion = companion
         self._pid = os.getpid()
         self._closed = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ SITES = ("plant1", "plant2", "plant3")
 THIN_HZ = 5.0
 RETURN_OF_A_ROBOT_S = 0.04
 """Its tokens, queryables and values cross the link of 2 Mbit/s again, before or between samples."""
+FULL_CUT_S = 20.0
 LOCAL = "tcp/127.0.0.1:7447"
 SHIFT_S = 2.0
 Spawn = Callable[..., Child]
@@ -157,3 +159,30 @@ def test_nothing_within_a_site_waits_for_a_full_uplink(spawn: Spawn, hosts: Name
     )
     assert arrived < 0.7 * found["sent"], "the uplink was not full"
     assert found["oldest_s"] < 1.0
+
+
+@pytest.mark.long
+def test_a_site_whose_uplink_was_full_when_it_was_cut_is_back_soon(
+    spawn: Spawn, hosts: NamespaceHosts, tmp_path: Path
+):
+    """A full socket of TLS; without a limit on it the return takes up to as long again as the cut."""
+    certificates.issue_identities(tmp_path, ["hq", "desk", "plant1"], hosts=[hosts.address("hq")])
+    identity = ("--certs", str(tmp_path), "--identity")
+    uplink = f"tls/{hosts.address('hq')}:7447"
+    hq = Host(spawn, hosts, "hq", ("--listen", "tls/0.0.0.0:7447", *identity, "hq"))
+    hq.start("counter", uplink, str(tmp_path))
+    options = ("--site", "plant1", "--uplink", uplink, "--robot", "r1", *identity, "plant1")
+    site = Host(spawn, hosts, "plant1", options)
+    site.start("flood", LOCAL)
+    site.send("run", 2.0 * FULL_CUT_S + 60.0)
+    until(lambda: hq.query("arrived") > 0, timeout_s=60.0)
+    began = time.monotonic()
+    hosts.drop_packets("plant1")
+    until(lambda: time.monotonic() > began + FULL_CUT_S, timeout_s=2.0 * FULL_CUT_S)
+    arrived = hq.query("arrived")
+    hosts.pass_packets("plant1")
+    healed = time.monotonic()
+    until(lambda: hq.query("arrived") > arrived, timeout_s=2.0 * FULL_CUT_S)
+    back_s = time.monotonic() - healed
+    print(f"full uplink, cut of {FULL_CUT_S:g} s: back after {back_s:.2f} s")
+    assert back_s < RECOVERED_WITHIN_S
