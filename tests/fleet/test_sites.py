@@ -18,6 +18,7 @@ from helpers.cli_runner import run_cli
 from helpers.fault_programs import ShiftedClock
 from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
+from helpers.slow_relay import SlowRelay
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect
 from zstate.errors import (
@@ -40,6 +41,8 @@ from zstate.odometry import ImuPublisher
 
 RATE_HZ = 50.0
 THIN_HZ = 5.0
+SLOW_LINK = {"bytes_per_s": 250_000.0, "delay_s": 0.08, "stalls": 0.01}
+"""2 Mbit/s, 80 ms each way; one chunk of a hundred stalls."""
 
 
 class Site(NamedTuple):
@@ -52,14 +55,23 @@ class Site(NamedTuple):
 
 
 @contextmanager
-def running_site(robots: tuple[str, ...], rates_hz: dict[str, float], **options: Any) -> Iterator[Site]:
-    """The programs of a site use a socket file, so the uplink is distinguished from it by its protocol."""
+def running_site(
+    robots: tuple[str, ...], rates_hz: dict[str, float], relay: dict[str, float] | None = None, **options: Any
+) -> Iterator[Site]:
+    """The programs of a site use a socket file, so the uplink is distinguished from it by its protocol.
+
+    With ``relay``, the options of one, the uplink is as slow as that.
+    """
     headquarters = f"tcp/127.0.0.1:{find_free_port()}"
     with ExitStack() as opened:
         folder = opened.enter_context(tempfile.TemporaryDirectory())
         site = f"unixsock-stream/{Path(folder) / 'site.sock'}"
-        link = Uplink("plant1", (headquarters,), rates_hz, robots, **options)
         opened.enter_context(connect(RouterConfig((headquarters,)).settings()))
+        uplink = headquarters
+        if relay is not None:
+            port = int(headquarters.rpartition(":")[2])
+            uplink = opened.enter_context(SlowRelay(port, **relay)).endpoint
+        link = Uplink("plant1", (uplink,), rates_hz, robots, **options)
         router = opened.enter_context(connect(RouterConfig((site,), uplink=link).settings()))
         opened.enter_context(SiteAnnouncement(router, link.site, link.rates_hz, robots))
         local = opened.enter_context(connect(mode="client", endpoints=site))
@@ -68,11 +80,15 @@ def running_site(robots: tuple[str, ...], rates_hz: dict[str, float], **options:
 
 
 @contextmanager
-def published(session: Session, robots: tuple[str, ...], rate_hz: float = RATE_HZ) -> Iterator[None]:
+def published(
+    session: Session, robots: tuple[str, ...], rate_hz: float = RATE_HZ, **options: Any
+) -> Iterator[None]:
     """rrbot under each name, moved at ``rate_hz`` by one thread."""
     stop = threading.Event()
     with ExitStack() as opened:
-        publishers = [opened.enter_context(StatePublisher(session, RRBOT, name)) for name in robots]
+        publishers = [
+            opened.enter_context(StatePublisher(session, RRBOT, name, **options)) for name in robots
+        ]
 
         def run() -> None:
             begin, tick = time.monotonic(), 0
@@ -201,6 +217,25 @@ def test_a_lookup_at_headquarters_is_exact_on_demand():
         early = near.buffer.latest("base", "lower") - 9_000_000_000
         with pytest.raises(InPast, match="all that its writer keeps"):
             far.lookup("base", "lower", early, exact=True)
+
+
+@pytest.mark.long
+def test_over_a_slow_link_that_stalls_lookups_go_on_and_exact_ones_equal_those_of_the_site():
+    robots = ("r1", "r2")
+    with (
+        running_site(robots, {"joint_states": THIN_HZ}, SLOW_LINK) as site,
+        published(site.local, robots, cache_s=30.0),
+        TransformListener(site.local, "r1") as near,
+        TransformListener(site.far, "r1", history_on_join=False) as far,
+    ):
+        until(lambda: far.stats.received >= 4, timeout_s=30.0)
+        for _ in range(15):
+            newest = far.buffer.latest("base", "lower")
+            far.buffer.wait("base", "lower", newest + 1, timeout_s=10.0)
+            at = far.buffer.latest("base", "lower") - 133_000_000
+            there = near.buffer.wait("base", "lower", at, timeout_s=10.0)
+            assert far.lookup("base", "lower", at, exact=True, timeout_s=10.0) == there
+        assert far.stats.refused == {}
 
 
 def test_a_writer_without_a_cache_is_named_by_an_exact_lookup():
