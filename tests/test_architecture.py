@@ -151,6 +151,7 @@ ON_USE = {
     "buffer.watch",
     "covariance",
     "model.joint_history",
+    "net.dead_links",
     "net.discovery",
     "net.edge_ownership",
     "net.environment",

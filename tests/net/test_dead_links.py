@@ -26,7 +26,8 @@ def limits_ms(port: int) -> Iterator[int]:
         with suppress(OSError):
             one = socket.socket(fileno=int(entry.name))
             try:
-                if port in (one.getsockname()[1], one.getpeername()[1]):
+                is_ip = one.family in (socket.AF_INET, socket.AF_INET6)
+                if is_ip and port in (one.getsockname()[1], one.getpeername()[1]):
                     yield one.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
             finally:
                 one.detach()

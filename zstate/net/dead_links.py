@@ -23,18 +23,14 @@ from zstate._util.endpoint import parse_endpoint
 
 LinkListener: TypeAlias = "zenoh.LinkEventsListener[None]"
 
-_TLS = "tls/"
-
 
 # zenoh 1.10, closing a TLS link that was cut off waits until its socket has room: delete when fixed
 def limit_dead_links(session: zenoh.Session, config: zenoh.Config) -> LinkListener | None:
     """Let the kernel end TLS connections of ``session`` whose other host acknowledges nothing for the lease.
 
-    The result holds as long as it is referenced. None without endpoints of TLS, and where the kernel has no
-    such limit: Linux has one.
+    The result holds as long as it is referenced. None where the kernel has no such limit: Linux has one.
     """
-    endpoints = config.get_json("connect/endpoints") + config.get_json("listen/endpoints")
-    if _TLS not in endpoints or sys.platform != "linux":
+    if sys.platform != "linux":
         return None
     lease_ms = int(json.loads(config.get_json("transport/link/tx/lease")))
     handler = zenoh.handlers.Callback(partial(_on_link, lease_ms), indirect=False)
@@ -44,7 +40,7 @@ def limit_dead_links(session: zenoh.Session, config: zenoh.Config) -> LinkListen
 def _on_link(lease_ms: int, event: zenoh.LinkEvent) -> None:
     """Called in a thread of Zenoh, which must not wait."""
     ends = parse_endpoint(str(event.link.src)), parse_endpoint(str(event.link.dst))
-    if event.kind != zenoh.SampleKind.PUT or None in ends or not str(event.link.src).startswith(_TLS):
+    if event.kind != zenoh.SampleKind.PUT or None in ends or not str(event.link.src).startswith("tls/"):
         return
     ports = tuple(end.port for end in ends if end is not None)
     for number in Path("/proc/self/fd").iterdir():

@@ -33,7 +33,6 @@ from zstate.net.config import (
     listen_endpoints,
     scouts_by_multicast,
 )
-from zstate.net.dead_links import limit_dead_links
 from zstate.net.open import open_with_retry
 
 if TYPE_CHECKING:
@@ -165,7 +164,12 @@ def _session(
         from zstate.net.security.probe import ProbeSession  # noqa: PLC0415 - as above
 
         probe = ProbeSession.for_config(config, credentials)
-    return Session(raw, monitor, probe=probe, limited=limit_dead_links(raw, config))
+    limited = None
+    if "tls/" in config.get_json("connect/endpoints") + config.get_json("listen/endpoints"):
+        from zstate.net.dead_links import limit_dead_links  # noqa: PLC0415 - as above
+
+        limited = limit_dead_links(raw, config)
+    return Session(raw, monitor, probe=probe, limited=limited)
 
 
 def _connection_monitor(
