@@ -132,7 +132,10 @@ def make_archive(
                         [row | dict.fromkeys(POSE)],
                     ),
                     f"{folder_of(MODELS)}/{model.digest}{SUFFIX}": (model_schema(), [described]),
-                    f"{folder_of(WRITERS, robot)}/{name}{SUFFIX}": (writers_schema(), []),
+                    f"{folder_of(WRITERS, robot)}/{name}{SUFFIX}": (
+                        writers_schema(),
+                        [{"import": name, "stream": JOINTS, "messages": samples}],
+                    ),
                     f"{folder_of(IMPORTS)}/{name}{SUFFIX}": (record_schema(), [one | facts for one in rows]),
                 }
                 for path, (schema, content) in tables.items():

@@ -8,7 +8,7 @@ view                rows
 ``frames``          static edges and models, by ``robot``
 ``writers``         the writers of each recording, by ``robot``
 ``models``          the URDFs, by ``digest``
-``files``           what each import has added: ``rows`` by ``robot`` and ``date``
+``files``           what each import has added: ``rows`` by ``robot`` and ``date`` (``record_schema`` there)
 ==================  ====================================================================================
 
 ``zstate_pose(robot, target, source, stamp)`` is the pose of a frame, a struct of x y z [m], qx qy qz qw, as
@@ -22,13 +22,28 @@ one that is under way, or was interrupted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.archive.layout import FRAMES, IMPORTS, MODELS, POSE, SUFFIX, WRITERS, folder_of, value_of
+from zstate.archive.layout import (
+    FRAMES,
+    MODELS,
+    POSE,
+    SUFFIX,
+    WRITERS,
+    folder_of,
+    frames_schema,
+    model_schema,
+    record_schema,
+    writers_schema,
+)
+from zstate.archive.ledger import Ledger, compacted_path, compacted_stem, record_path
 from zstate.archive.storage import Store, arrow
 from zstate.errors import LibraryMissing
 
@@ -37,6 +52,16 @@ if TYPE_CHECKING:
 
 Lookup: TypeAlias = Callable[[NDArray[Any], str, str, NDArray[np.int64]], NDArray[np.float64]]
 """Poses of one frame in another, at the stamps [ns] of robots: (T, 7), NaN where there is none."""
+
+
+_LISTS = ("list<item: double>", "list<element: double>")
+_TYPES = {
+    **{"int64": "BIGINT", "double": "DOUBLE", "bool": "BOOLEAN", "string": "VARCHAR", "binary": "BLOB"},
+    **{"date32": "DATE", **dict.fromkeys(_LISTS, "DOUBLE[]")},
+}
+"""The types of DuckDB, by those of Arrow that archives have."""
+
+_NUMBERS = {"int64", "double", "bool"}
 
 
 def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
@@ -51,17 +76,10 @@ def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
             f"SQL needs duckdb, which cannot be loaded ({error}): pip install 'zstate[archive]'"
         ) from None
     connection = duckdb.connect()
-    for name, table in (("listed", IMPORTS), ("models", MODELS)):
-        _add_view(connection, store, name, [file.path for file in store.files(folder_of(table))])
-    if store.names(folder_of(IMPORTS)):  # read once, here: there are as many small files as imports
-        connection.execute("CREATE TABLE files AS SELECT * FROM listed; DROP VIEW listed")
-    complete = _Complete.read(connection, store)
-    for name, table in (("frames", FRAMES), ("writers", WRITERS)):
-        _add_view(connection, store, name, complete.of_table(store, table))
-    for folder in store.folders(""):
-        if folder.startswith("stream="):
-            paths = [file.path for file in store.files(folder) if file.path in complete.paths]
-            _add_view(connection, store, value_of(folder), paths, "make_timestamp_ns(stamp) AS time, *")
+    ledger = Ledger(store)
+    _add_files(connection, store, ledger)
+    _add_tables(connection, store, ledger)
+    _add_streams(connection, store)
     poses = ", ".join(f"{name} DOUBLE" for name in POSE)
     create_function: Any = connection.create_function  # its annotations are others in each version
     parameters = ["VARCHAR", "VARCHAR", "VARCHAR", "BIGINT"]
@@ -88,52 +106,125 @@ class _PoseFunction:
         return pa.StructArray.from_arrays(columns, POSE, mask=pa.array(np.isnan(poses[:, 0])))
 
 
-class _Complete(NamedTuple):
-    """What complete imports have: their ``names``, the ``paths`` of their samples, and of their frames."""
+def _add_files(connection: Any, store: Store, ledger: Ledger) -> None:
+    """Make the table ``files``: its files are read once, here, as there may be as many as imports."""
+    own, again = ledger.counted()
+    columns = _types_of(record_schema())
+    made = ", ".join(f"{_quoted(name)} {_TYPES[kind]}" for name, kind in columns.items())
+    connection.execute(f"CREATE TABLE files ({made})")
+    compacted = [compacted_path(ledger.number)] if ledger.number else []
+    for name, paths in (("records", [record_path(name) for name in own]), ("compacted", compacted)):
+        if not paths:
+            continue
+        _add_view(connection, store, name, paths, columns)
+        replaced = list(again) if paths is compacted else []
+        select = f"SELECT * FROM {name} WHERE path != '' AND NOT coalesce(list_contains(?, import), false)"
+        connection.execute(f"INSERT INTO files {select}", [replaced])
+        connection.execute(f"DROP VIEW {name}")
 
-    names: set[str]
-    paths: set[str]
-    frames: set[str]
 
-    @classmethod
-    def read(cls, connection: Any, store: Store) -> _Complete:
-        """What the view ``files`` lists."""
-        names = {name.removesuffix(SUFFIX) for name in store.names(folder_of(IMPORTS))}
-        if not names:
-            return cls(set(), set(), set())
-        rows = connection.execute("SELECT path, robot, frames FROM files").fetchall()
-        frames = {f"{folder_of(FRAMES, robot)}/{digest}{SUFFIX}" for _, robot, digest in rows}
-        return cls(names, {path for path, _, _ in rows}, frames)
-
-    def of_table(self, store: Store, table: str) -> list[str]:
-        """The files of ``table``, frames or writers."""
+def _add_tables(connection: Any, store: Store, ledger: Ledger) -> None:
+    """Add views of the tables ``frames``, ``models`` and ``writers``, of what counts in them."""
+    robots = connection.execute("SELECT DISTINCT robot, frames FROM files").fetchall()
+    frames = {f"{folder_of(FRAMES, robot)}/{digest}{SUFFIX}" for robot, digest in robots}
+    stems = {*ledger.recorded_names()} - ledger.imported().keys() | {compacted_stem(ledger.number)}
+    for name, table, schema in (
+        ("models", MODELS, model_schema()),
+        ("frames", FRAMES, frames_schema()),
+        ("writers", WRITERS, writers_schema()),
+    ):
         paths = [file.path for file in store.files(folder_of(table))]
         if table == FRAMES:
-            return [path for path in paths if path in self.frames]
-        return [path for path in paths if path.rpartition("/")[2].removesuffix(SUFFIX) in self.names]
+            paths = [path for path in paths if path in frames]
+        elif table == WRITERS:
+            paths = [path for path in paths if Path(path).name.removesuffix(SUFFIX) in stems]
+        _add_view(connection, store, name, paths, _types_of(schema))
 
 
-def _add_view(connection: Any, store: Store, name: str, paths: Sequence[str], columns: str = "*") -> None:
-    """A view of the files ``paths``; none without a file."""
+def _add_streams(connection: Any, store: Store) -> None:
+    """Add a view of each stream, of the files that the table ``files`` lists and that are there."""
+    query = "SELECT stream, columns, list(DISTINCT path) FROM files GROUP BY ALL"
+    listed: dict[str, dict[str, str | None]] = {}
+    for stream, columns, paths in connection.execute(query).fetchall():
+        listed.setdefault(stream, {}).update(dict.fromkeys(paths, columns))
+    for stream, columns_of in listed.items():
+        paths = [file.path for file in store.files(folder_of(stream)) if file.path in columns_of]
+        layouts = {columns_of[path] or _columns_of(store, path) for path in paths}
+        columns = _united([json.loads(layout) for layout in sorted(layouts)])
+        _add_view(connection, store, stream, paths, columns, select="make_timestamp_ns(stamp) AS time, *")
+
+
+def _columns_of(store: Store, path: str) -> str:
+    """The columns of a file whose record does not list them."""
+    with store.opened(path) as file:
+        return json.dumps(_types_of(arrow().parquet.read_schema(file)))
+
+
+def _types_of(schema: Any) -> dict[str, str]:
+    return {field.name: str(field.type) for field in schema}
+
+
+def _united(layouts: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """The columns of all ``layouts``; of several types that hold the values of each."""
+    found: dict[str, str] = {}
+    for name, kind in (item for layout in layouts for item in layout.items()):
+        if found.setdefault(name, kind) != kind:
+            found[name] = "double" if {found[name], kind} <= _NUMBERS else "string"
+    return found
+
+
+def _quoted(name: str, mark: str = '"') -> str:
+    return mark + name.replace(mark, 2 * mark) + mark
+
+
+def _add_view(
+    connection: Any,
+    store: Store,
+    name: str,
+    paths: Sequence[str],
+    columns: Mapping[str, str],
+    *,
+    select: str = "*",
+) -> None:
+    """A view of the files ``paths`` with ``columns`` and their types; none without files. It opens no file.
+
+    A column that a file does not have is NULL there.
+    """
     if not paths:
         return
-    quoted = '"' + name.replace('"', '""') + '"'
+    folders = [folder for folder in paths[0].split("/")[:-1] if "=" in folder]
+    keys = {
+        folder.partition("=")[0]: "date32" if folder.startswith("date=") else "string" for folder in folders
+    }
     full = [f"{store.root}/{path}" for path in paths]
     if store.is_local:  # DuckDB reads the files itself
-        is_alike = not paths[0].startswith("stream=")  # then one file shows the columns of all
-        options = f"hive_partitioning = true, union_by_name = {str(not is_alike).lower()}"
-        literals = ", ".join("'" + path.replace("'", "''") + "'" for path in full)
-        source = f"read_parquet([{literals}], {options})"
+        text = partial(_quoted, mark="'")
+        wanted = (
+            f"{text(one)}: {{name: {text(one)}, type: '{_TYPES[kind]}', default_value: NULL}}"
+            for one, kind in columns.items()
+        )
+        hive = ", ".join(f"{key}: {_TYPES[kind]}" for key, kind in keys.items())
+        options = (
+            f"hive_partitioning = true, hive_types = {{{hive}}}" if keys else "hive_partitioning = false"
+        )
+        files = ", ".join(map(text, full))
+        source = f"read_parquet([{files}], schema = MAP {{{', '.join(wanted)}}}, {options})"
     else:
-        fs = arrow().dataset
-        dataset = fs.dataset(
+        pa = arrow()
+        fields = [(one, pa.list_(pa.float64()) if kind in _LISTS else kind) for one, kind in columns.items()]
+        fields += keys.items()
+        schema = pa.schema(
+            [(one, pa.type_for_alias(kind) if isinstance(kind, str) else kind) for one, kind in fields]
+        )
+        flavor = pa.dataset.partitioning(pa.schema([schema.field(key) for key in keys]), flavor="hive")
+        source = _quoted(f"{name} files")
+        dataset = pa.dataset.dataset(
             full,
+            schema=schema,
             filesystem=store.filesystem,
-            partitioning=fs.partitioning(flavor="hive"),
+            partitioning=flavor if keys else None,
             partition_base_dir=f"{store.root}/{paths[0].partition('/')[0]}",
             format="parquet",
         )
-        schemas = [dataset.schema, *(one.physical_schema for one in dataset.get_fragments())]
-        source = f'"{name} files"'
-        connection.register(f"{name} files", dataset.replace_schema(arrow().unify_schemas(schemas)))
-    connection.execute(f"CREATE VIEW {quoted} AS SELECT {columns} FROM {source}")
+        connection.register(f"{name} files", dataset)
+    connection.execute(f"CREATE VIEW {_quoted(name)} AS SELECT {select} FROM {source}")
