@@ -563,17 +563,17 @@ def fleet() -> Figure:
     """The live side of several sites, and the recorded side."""
     figure = Figure(720, 330, "Sites thin what leaves them; recordings of all go into one archive")
     figure.text(20, 26, "live: Zenoh", "bold ta", "start")
-    figure.text(20, 190, "recorded: Parquet", "bold tc", "start")
+    figure.text(190, 198, "recorded: Parquet", "bold tc", "start")
     for n, site in enumerate(("site plant1", "site plant2")):
         y = 40 + 62 * n
         figure.box(20, y, (110, 44), f"{site}\nrobots, readers", "fa")
         figure.arrow((130, y + 22), (188, y + 22), "", "a", ">")
         figure.box(190, y, (96, 44), "router\nfull rate", "fb")
         figure.path(((286, y + 22), (418, 93)), "b", ">")
-    figure.text(360, 52, "uplink: 5 Hz,\nnamed streams", "s t")
+    figure.text(366, 40, "uplink: 5 Hz,\nnamed streams", "s t")
     figure.box(420, 71, (96, 44), "router\nheadquarters", "fb")
     figure.arrow((516, 93), (574, 93), "", "a", ">")
-    figure.box(576, 71, (124, 44), "readers\nstale in 1 s", "fa")
+    figure.box(576, 71, (124, 44), "readers\nof all sites", "fa")
     figure.path(((75, 146), (75, 214)), "c", ">")
     figure.text(84, 172, "zstate record --archive", "code", "start")
     figure.box(20, 216, (110, 44), "recorder\nMCAP files", "fa")
