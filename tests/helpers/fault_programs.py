@@ -30,6 +30,7 @@ from zstate import (
 from zstate.clock import SystemClock
 from zstate.fleet.acl import AclRoles, access_control
 from zstate.fleet.router_config import RouterConfig
+from zstate.ingest.base import StreamIngest
 from zstate.net import streams
 from zstate.net.security.credentials import Credentials
 from zstate.nodes.partial_publisher import PartialStatePublisher
@@ -268,7 +269,7 @@ def router(
 
 
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
-    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long, and few samples wait.
+    """Listens to robots; with ``busy_ms`` each sample blocks the process for that long, and few samples wait.
 
     Replies to the queries of ``ReaderQueries`` about the arm, as ``odometry NAME`` about the odometry, and as
     ``joints NAME``, ``shoulder NAME`` and ``elbow NAME`` about ``JointsMotion``, all of it and of one joint.
@@ -276,6 +277,7 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
     # Merged readings are of one instant, some of their positions up to the age limit older.
     if busy_ms:
         streams.CAPACITY = 64
+        _slow_down_live_samples(busy_ms)
     tolerance = 1e-9 if follow == "joint_states" else sum(map(abs, JointsMotion.RATES)) * MAX_AGE_S * REACH
     with (
         join(session) as opened,
@@ -288,8 +290,6 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
             "shoulder ": ReaderQueries(listener, JointsMotion("world", "upper")),
             "elbow ": ReaderQueries(listener, JointsMotion("upper", "lower")),
         }
-        if busy_ms:
-            _slow_down_inserts(listener, busy_ms)
         names = (
             "after",
             "newest",
@@ -310,13 +310,14 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
         )
 
 
-def _slow_down_inserts(listener: TransformListener, busy_ms: float) -> None:
-    insert = listener.buffer.insert_joints
+def _slow_down_live_samples(busy_ms: float) -> None:
+    insert = StreamIngest.insert_sample
 
-    def slowly(*arguments: Any) -> bool:
+    def slowly(*arguments: Any, **options: Any) -> None:
         until = time.perf_counter() + busy_ms * 1e-3
         while time.perf_counter() < until:
             pass
-        return insert(*arguments)
+        insert(*arguments, **options)
 
-    listener.buffer.insert_joints = slowly  # type: ignore[method-assign]
+    StreamIngest.insert_sample = slowly  # type: ignore[method-assign]
+    StreamIngest.insert_next = lambda *_: False  # type: ignore[method-assign]  # its inserts are not slow

@@ -229,7 +229,7 @@ def test_values_of_many_publishers_are_requested_a_few_at_a_time(free_port: int)
 def test_value_that_does_not_arrive_is_logged(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("zstate.net.latched._ANSWER_WITHIN_S", 0.2)
+    monkeypatch.setattr("zstate.net.latched._TIMEOUTS_S", (0.1, 0.2, 0.3))
     with connect() as writer, connect() as reader:
         token = f"{key('a')}/@adv/pub/{writer.zid}/7/_"
         requests: zenoh.Queryable = writer.zenoh.declare_queryable(token, zenoh.handlers.FifoChannel(8))
@@ -237,7 +237,7 @@ def test_value_that_does_not_arrive_is_logged(
         values = Values(reader)
         until(lambda: key("a") in caplog.text)
         assert not values.received
-        assert "3 requests" in caplog.text
+        assert "3 requests, the last of 0.3 s" in caplog.text
         del requests, announced
 
 

@@ -55,6 +55,40 @@ def decode_still(data: bytes, form: PictureFormat) -> Pixels:
         raise MessageError(f"a broken jpeg of {len(data)} bytes: {error}", reason="broken") from None
 
 
+class PacketOrder:
+    """The packets of one video, one after the other: which can be decoded.
+
+    They begin with a key frame, and again after a packet that was lost or broken.
+    """
+
+    def __init__(self, form: PictureFormat) -> None:
+        self.form: PictureFormat = form
+        self._is_waiting = True
+        self._next: tuple[int, int] | None = None
+
+    def skip(self) -> None:
+        """Wait for the next key frame: a packet is lost."""
+        self._is_waiting = True
+
+    def begins(self, packet: bytes, number: tuple[int, int] | None = None) -> bool:
+        """Whether the next packet is a key frame that was waited for.
+
+        ``number`` is the session of its writer, and the number in it: a gap is a loss. Raises MessageError
+        with the reason "no key frame" if the packet cannot be decoded.
+        """
+        if number is not None:
+            if number != self._next:
+                self.skip()
+            self._next = number[0], number[1] + 1
+        if not self._is_waiting:
+            return False
+        if not is_key_frame(packet, self.form):
+            text = f"a packet of {self.form} before the first key frame, or after a loss"
+            raise MessageError(text, reason="no key frame")
+        self._is_waiting = False
+        return True
+
+
 class VideoDecoder:
     """Decodes the packets of one video, one after the other; each gives a picture, as there are no B-frames.
 
@@ -65,26 +99,18 @@ class VideoDecoder:
         self.form: PictureFormat = form
         self._av = pyav()
         self._decoder: Any = None
-        self._next: tuple[int, int] | None = None
+        self._order = PacketOrder(form)
 
     def skip(self) -> None:
         """Wait for the next key frame: a packet is lost."""
-        self._decoder = None
+        self._order.skip()
 
     def decode(self, packet: bytes, number: tuple[int, int] | None = None) -> Pixels:
         """The pixels of the next packet: RGB (H, W, 3).
 
-        ``number`` is the session of its writer, and the number in it: a gap is a loss. Raises MessageError
-        with the reason "no key frame" if it waits for one, or "broken".
+        ``number`` as of ``PacketOrder``. Raises MessageError with its reason "no key frame", or "broken".
         """
-        if number is not None:
-            if number != self._next:
-                self.skip()
-            self._next = number[0], number[1] + 1
-        if self._decoder is None:
-            if not is_key_frame(packet, self.form):
-                text = f"a packet of {self.form} before the first key frame, or after a loss"
-                raise MessageError(text, reason="no key frame")
+        if self._order.begins(packet, number):
             self._decoder = self._av.CodecContext.create(_DECODERS[self.form], "r")
             self._decoder.thread_count = 1  # with more of them a picture comes some packets later
             self._decoder.options = {"max_pixels": str(PICTURE_PIXELS)}

@@ -30,8 +30,8 @@ HEARTBEAT_S = 0.5
 _LOG = logging.getLogger("zstate")
 
 _MAX_IN_FLIGHT = 8
-_MAX_ATTEMPTS = 3
-_ANSWER_WITHIN_S = 2.0
+_TIMEOUTS_S = 2.0, 8.0, 60.0
+"""Of a request and its repetitions: a map of 16 MB takes longer than the first over a slow link."""
 
 
 class LatchedPublisher(Closeable):
@@ -185,15 +185,15 @@ class _CacheRequest(Request):
         self._has_timed_out = False
 
     def send(self, session: zenoh.Session, handler: ReplyHandler) -> None:
-        self._attempts += 1
         self._has_timed_out = False
         session.get(
             f"{self._token}?_max=1",
             handler,
-            timeout=_ANSWER_WITHIN_S,
+            timeout=_TIMEOUTS_S[self._attempts],
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
         )
+        self._attempts += 1
 
     def on_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
@@ -204,7 +204,7 @@ class _CacheRequest(Request):
     def on_end(self) -> float | None:
         if not self._has_timed_out:
             return None
-        if self._attempts < _MAX_ATTEMPTS:
+        if self._attempts < len(_TIMEOUTS_S):
             return 0.0
         _log_silent_publisher(self.source)
         return None
@@ -213,7 +213,7 @@ class _CacheRequest(Request):
 def _log_silent_publisher(key: str) -> None:
     facts = {"event": "no latched value", "key": key}
     text = (
-        "the publisher of %r is announced, but its current value did not arrive in %d requests of %g s each; "
-        "it is received when it changes. Its process is suspended, or the link is too slow for its size"
+        "the publisher of %r is announced, but its current value did not arrive in %d requests, the last of "
+        "%g s; it is received when it changes. Its process is suspended, or the link is too slow for its size"
     )
-    _LOG.warning(text, key, _MAX_ATTEMPTS, _ANSWER_WITHIN_S, extra=facts)
+    _LOG.warning(text, key, len(_TIMEOUTS_S), _TIMEOUTS_S[-1], extra=facts)

@@ -431,34 +431,29 @@ def _pictures(
 
     The packets of a video begin with a key frame, and after a lost one again.
     """
-    from zstate.cameras.messages import CompressedImage  # noqa: PLC0415 - cameras are a plugin
-    from zstate.cameras.pictures import is_key_frame  # noqa: PLC0415
+    from zstate.cameras.codecs import PacketOrder  # noqa: PLC0415 - cameras are a plugin
+    from zstate.cameras.messages import CompressedImage  # noqa: PLC0415
 
-    last: dict[str, CompressedImage] = {}
+    orders: dict[str, PacketOrder] = {}
     newest: dict[str, int] = {}
-    broken: set[str] = set()
     for writer, message, _ in recording.measurements("image", robot, refuse=refuse):
         assert isinstance(message, CompressedImage)
         camera = writer.edge_writer or writer.stream
-        before = last.get(camera)
-        if before is None or _of_packet(message) != (before.format, before.session, before.seq + 1):
-            broken.add(camera)
-        if is_key_frame(message.data, message.format):
-            broken.discard(camera)
-        last[camera] = message
+        order = orders.get(camera)
+        if order is None or order.form != message.format:
+            order = orders[camera] = PacketOrder(message.format)
+        try:
+            order.begins(message.data, (message.session, message.seq))
+        except MessageError as error:
+            refuse(error.reason, f"{camera!r}: {error}")
+            continue
         if camera in newest and message.stamp <= newest[camera]:
-            broken.add(camera)
+            order.skip()
             text = f"{camera!r}: a picture with the stamp {message.stamp} after {newest[camera]}"
             refuse("not later", text)
-        elif camera in broken:
-            refuse("no key frame", f"{camera!r}: a packet before the first key frame, or after a loss")
-        else:
-            newest[camera] = message.stamp
-            yield camera, message
-
-
-def _of_packet(message: CompressedImage) -> tuple[str, int, int]:
-    return message.format, message.session, message.seq
+            continue
+        newest[camera] = message.stamp
+        yield camera, message
 
 
 def _nearest(stamps: Stamps, instants: Stamps) -> NDArray[np.intp]:

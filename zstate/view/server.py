@@ -103,11 +103,13 @@ class ViewServer(Closeable):
         """Set while at least one browser shows the page."""
         self._has_refused = False
         self._answered_at: dict[ServerConnection, float] = {}
+        opened: list[int] = []
         try:
-            with _opening, _no_output(), self._guarded_serve() as opened:
+            with _opening, _no_output(), self._guarded_serve(opened):
                 self.server = _Server(host, self.port, "zstate", verbose=False)
         except BaseException:
-            self._socket.close()
+            if not opened:  # else the thread of viser closes it, at exit
+                self._socket.close()
             raise
         if not opened:
             self.close()
@@ -143,14 +145,13 @@ class ViewServer(Closeable):
         (self.connected.set if self.server.get_clients() else self.connected.clear)()
 
     @contextlib.contextmanager
-    def _guarded_serve(self) -> Generator[list[int]]:
+    def _guarded_serve(self, opened: list[int]) -> Generator[None]:
         """Makes a websockets server that is opened inside use our socket and the access checks.
 
-        Yields a list that receives its port. viser has no option for this: it listens at a host and the next
-        free port, and answers every request.
+        ``opened`` receives its port. viser has no option for this: it listens at a host and the next free
+        port, and answers every request.
         """
         original = websockets.asyncio.server.serve
-        opened: list[int] = []
 
         def serve(
             handler: Any, host: str, port: int, *, process_request: Any, **options: Any
@@ -169,7 +170,7 @@ class ViewServer(Closeable):
 
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
         try:
-            yield opened
+            yield
         finally:
             websockets.asyncio.server.serve = original
 

@@ -62,7 +62,10 @@ def test_frozen_reader_blocks_neither_the_writer_nor_other_readers(start: Start,
     closing_s = publisher.query("leave")
     print(f"a reader frozen, {way}: the other's longest gap {watched['gap_ns'] * 1e-9:.3f} s, the writer's ")
     print(f"session closes in {closing_s:.3f} s")
-    assert (stats["missed"], watched["stale"]) == (0, 0)
+    assert stats["missed"] == 0
+    assert watched["gap_ns"] < FROZEN_S * 1e9 / 2, (
+        "the other reader waits for no frozen one; a busy machine pauses"
+    )
     assert closing_s < RECOVERED_WITHIN_S
     frozen.signal(signal.SIGCONT)
     assert frozen.query("census")

@@ -23,7 +23,6 @@ from zstate.cli.output.console import count_text, fail, print_status, print_wrap
 from zstate.cli.output.wire_text import default_stream, messages_for
 from zstate.cli.robot_directory import RobotDirectory, only_robot
 from zstate.cli.session import SessionOptions, open_session
-from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing
 
 if TYPE_CHECKING:
@@ -266,6 +265,7 @@ def _live_path(
 ) -> TimeSeries:
     """The path of frame B in frame A for ``seconds`` from now on. Fails if no pose is known within 10 s."""
     from zstate.cli.waiting import PoseWaiter
+    from zstate.clock import wait_interruptible
     from zstate.nodes.listener import TransformListener
 
     follow, history_s = default_stream(wire), seconds + 1.0
