@@ -278,3 +278,8 @@ def test_drivers_of_some_joints_each_are_merged_by_their_joints(tmp_path: Path):
     found = Archive(url).lookup_many("world", "tool", stamps, robot="arm")
     assert np.array_equal(found[0], expected[0], equal_nan=True)
     assert len(list(Path(url).glob("stream=partial_joint_states/*/*/*"))) == 2
+    with Archive(url).duckdb() as sql:
+        query = (
+            'SELECT count(*), count("position.shoulder"), count("position.elbow") FROM partial_joint_states'
+        )
+        assert sql.sql(query).fetchall() == [(120, 60, 60)]  # files of other columns in one view

@@ -23,8 +23,7 @@ one that is under way, or was interrupted.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -38,10 +37,7 @@ from zstate.archive.layout import (
     SUFFIX,
     WRITERS,
     folder_of,
-    frames_schema,
-    model_schema,
     record_schema,
-    writers_schema,
 )
 from zstate.archive.ledger import Ledger, compacted_path, compacted_stem, record_path
 from zstate.archive.storage import Store, arrow
@@ -52,16 +48,6 @@ if TYPE_CHECKING:
 
 Lookup: TypeAlias = Callable[[NDArray[Any], str, str, NDArray[np.int64]], NDArray[np.float64]]
 """Poses of one frame in another, at the stamps [ns] of robots: (T, 7), NaN where there is none."""
-
-
-_LISTS = ("list<item: double>", "list<element: double>")
-_TYPES = {
-    **{"int64": "BIGINT", "double": "DOUBLE", "bool": "BOOLEAN", "string": "VARCHAR", "binary": "BLOB"},
-    **{"date32": "DATE", **dict.fromkeys(_LISTS, "DOUBLE[]")},
-}
-"""The types of DuckDB, by those of Arrow that archives have."""
-
-_NUMBERS = {"int64", "double", "bool"}
 
 
 def connect(store: Store, lookup: Lookup) -> DuckDBPyConnection:
@@ -109,18 +95,18 @@ class _PoseFunction:
 def _add_files(connection: Any, store: Store, ledger: Ledger) -> None:
     """Make the table ``files``: its files are read once, here, as there may be as many as imports."""
     own, again = ledger.counted()
-    columns = _types_of(record_schema())
-    made = ", ".join(f"{_quoted(name)} {_TYPES[kind]}" for name, kind in columns.items())
-    connection.execute(f"CREATE TABLE files ({made})")
-    compacted = [compacted_path(ledger.number)] if ledger.number else []
-    for name, paths in (("records", [record_path(name) for name in own]), ("compacted", compacted)):
-        if not paths:
-            continue
-        _add_view(connection, store, name, paths, columns)
-        replaced = list(again) if paths is compacted else []
-        select = f"SELECT * FROM {name} WHERE path != '' AND NOT coalesce(list_contains(?, import), false)"
-        connection.execute(f"INSERT INTO files {select}", [replaced])
-        connection.execute(f"DROP VIEW {name}")
+    types = {field.name: "BIGINT" if str(field.type) == "int64" else "VARCHAR" for field in record_schema()}
+    columns = ", ".join(f"NULL::{kind} AS {_quoted(one)}" for one, kind in types.items())
+    selects = [f"SELECT {columns} WHERE false"]
+    if own:
+        _add_view(connection, store, "records", [[record_path(name) for name in own]])
+        selects.append("SELECT * FROM records")
+    if ledger.number:
+        _add_view(connection, store, "compacted", [[compacted_path(ledger.number)]])
+        replaced = ", ".join(_quoted(one, "'") for one in ["", *sorted(again)])
+        selects.append(f"SELECT * FROM compacted WHERE import NOT IN ({replaced}) AND path != ''")
+    connection.execute(f"CREATE TABLE files AS {' UNION ALL BY NAME '.join(selects)}")
+    connection.execute("DROP VIEW IF EXISTS records; DROP VIEW IF EXISTS compacted")
 
 
 def _add_tables(connection: Any, store: Store, ledger: Ledger) -> None:
@@ -128,17 +114,13 @@ def _add_tables(connection: Any, store: Store, ledger: Ledger) -> None:
     robots = connection.execute("SELECT DISTINCT robot, frames FROM files").fetchall()
     frames = {f"{folder_of(FRAMES, robot)}/{digest}{SUFFIX}" for robot, digest in robots}
     stems = {*ledger.recorded_names()} - ledger.imported().keys() | {compacted_stem(ledger.number)}
-    for name, table, schema in (
-        ("models", MODELS, model_schema()),
-        ("frames", FRAMES, frames_schema()),
-        ("writers", WRITERS, writers_schema()),
-    ):
+    for name, table in (("models", MODELS), ("frames", FRAMES), ("writers", WRITERS)):
         paths = [file.path for file in store.files(folder_of(table))]
         if table == FRAMES:
             paths = [path for path in paths if path in frames]
         elif table == WRITERS:
             paths = [path for path in paths if Path(path).name.removesuffix(SUFFIX) in stems]
-        _add_view(connection, store, name, paths, _types_of(schema))
+        _add_view(connection, store, name, [paths])
 
 
 def _add_streams(connection: Any, store: Store) -> None:
@@ -149,28 +131,16 @@ def _add_streams(connection: Any, store: Store) -> None:
         listed.setdefault(stream, {}).update(dict.fromkeys(paths, columns))
     for stream, columns_of in listed.items():
         paths = [file.path for file in store.files(folder_of(stream)) if file.path in columns_of]
-        layouts = {columns_of[path] or _columns_of(store, path) for path in paths}
-        columns = _united([json.loads(layout) for layout in sorted(layouts)])
-        _add_view(connection, store, stream, paths, columns, select="make_timestamp_ns(stamp) AS time, *")
+        alike: dict[str, list[str]] = {}
+        for path in paths:
+            alike.setdefault(columns_of[path] or _columns_of(store, path), []).append(path)
+        _add_view(connection, store, stream, list(alike.values()), "make_timestamp_ns(stamp) AS time, *")
 
 
 def _columns_of(store: Store, path: str) -> str:
     """The columns of a file whose record does not list them."""
     with store.opened(path) as file:
-        return json.dumps(_types_of(arrow().parquet.read_schema(file)))
-
-
-def _types_of(schema: Any) -> dict[str, str]:
-    return {field.name: str(field.type) for field in schema}
-
-
-def _united(layouts: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """The columns of all ``layouts``; of several types that hold the values of each."""
-    found: dict[str, str] = {}
-    for name, kind in (item for layout in layouts for item in layout.items()):
-        if found.setdefault(name, kind) != kind:
-            found[name] = "double" if {found[name], kind} <= _NUMBERS else "string"
-    return found
+        return json.dumps({field.name: str(field.type) for field in arrow().parquet.read_schema(file)})
 
 
 def _quoted(name: str, mark: str = '"') -> str:
@@ -178,53 +148,37 @@ def _quoted(name: str, mark: str = '"') -> str:
 
 
 def _add_view(
-    connection: Any,
-    store: Store,
-    name: str,
-    paths: Sequence[str],
-    columns: Mapping[str, str],
-    *,
-    select: str = "*",
+    connection: Any, store: Store, name: str, alike: Sequence[Sequence[str]], select: str = "*"
 ) -> None:
-    """A view of the files ``paths`` with ``columns`` and their types; none without files. It opens no file.
+    """A view of the files ``alike``, each of a list with the same columns; none without files.
 
-    A column that a file does not have is NULL there.
+    One file of each list is opened. A column that a file does not have is NULL there.
     """
-    if not paths:
-        return
-    folders = [folder for folder in paths[0].split("/")[:-1] if "=" in folder]
-    keys = {
-        folder.partition("=")[0]: "date32" if folder.startswith("date=") else "string" for folder in folders
-    }
-    full = [f"{store.root}/{path}" for path in paths]
-    if store.is_local:  # DuckDB reads the files itself
-        text = partial(_quoted, mark="'")
-        wanted = (
-            f"{text(one)}: {{name: {text(one)}, type: '{_TYPES[kind]}', default_value: NULL}}"
-            for one, kind in columns.items()
-        )
-        hive = ", ".join(f"{key}: {_TYPES[kind]}" for key, kind in keys.items())
-        options = (
-            f"hive_partitioning = true, hive_types = {{{hive}}}" if keys else "hive_partitioning = false"
-        )
-        files = ", ".join(map(text, full))
-        source = f"read_parquet([{files}], schema = MAP {{{', '.join(wanted)}}}, {options})"
-    else:
+    sources: list[str] = []
+    for number, paths in enumerate(paths for paths in alike if paths):
+        folders = [folder.partition("=")[0] for folder in paths[0].split("/")[:-1] if "=" in folder]
+        full = [f"{store.root}/{path}" for path in paths]
+        if store.is_local:  # DuckDB reads the files itself
+            types = ", ".join(f"{key}: {'DATE' if key == 'date' else 'VARCHAR'}" for key in folders)
+            hive = (
+                f"hive_partitioning = true, hive_types = {{{types}}}"
+                if folders
+                else "hive_partitioning = false"
+            )
+            texts = ", ".join(_quoted(one, "'") for one in full)
+            sources.append(f"read_parquet([{texts}], {hive})")
+            continue
         pa = arrow()
-        fields = [(one, pa.list_(pa.float64()) if kind in _LISTS else kind) for one, kind in columns.items()]
-        fields += keys.items()
-        schema = pa.schema(
-            [(one, pa.type_for_alias(kind) if isinstance(kind, str) else kind) for one, kind in fields]
-        )
-        flavor = pa.dataset.partitioning(pa.schema([schema.field(key) for key in keys]), flavor="hive")
-        source = _quoted(f"{name} files")
+        keys = pa.schema([(key, pa.date32() if key == "date" else pa.string()) for key in folders])
         dataset = pa.dataset.dataset(
             full,
-            schema=schema,
             filesystem=store.filesystem,
-            partitioning=flavor if keys else None,
+            partitioning=pa.dataset.partitioning(keys, flavor="hive") if folders else None,
             partition_base_dir=f"{store.root}/{paths[0].partition('/')[0]}",
             format="parquet",
         )
-        connection.register(f"{name} files", dataset)
-    connection.execute(f"CREATE VIEW {_quoted(name)} AS SELECT {select} FROM {source}")
+        connection.register(f"{name} files {number}", dataset)
+        sources.append(_quoted(f"{name} files {number}"))
+    if sources:
+        united = " UNION ALL BY NAME ".join(f"SELECT * FROM {source}" for source in sources)
+        connection.execute(f"CREATE VIEW {_quoted(name)} AS SELECT {select} FROM ({united})")
