@@ -14,7 +14,7 @@ view                rows
 ``zstate_pose(robot, target, source, stamp)`` is the pose of a frame, a struct of x y z [m], qx qy qz qw, as
 ``Archive.lookup_many`` returns it; NULL where there is none. Select by ``robot`` and ``date``: only files of
 these are read then. Views show the imports that were complete when the connection was made, and nothing of
-one that is under way, or was interrupted.
+one that is under way, or was interrupted. After a compaction, which replaces files, make another connection.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
