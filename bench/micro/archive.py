@@ -3,8 +3,8 @@
 A recording of ``robot`` at 1 kHz, joint states without transforms, is imported. Then a synthetic archive is
 made of ``robots`` for ``days``, ``seconds`` a day at ``rate`` samples a second, an import for each robot and
 day. Poses of the last link in the first are looked up at ``poses`` stamps between the samples, evenly over
-all robots and days; then it is compacted. Files may be in the page cache; the first of the times is with nothing read by this
-process.
+all robots and days; then it is compacted. Files may be in the page cache; the first of the times is with
+nothing read by this process.
 """
 
 from __future__ import annotations
