@@ -559,6 +559,35 @@ def archive() -> Figure:
     return figure
 
 
+def fleet() -> Figure:
+    """The live side of several sites, and the recorded side."""
+    figure = Figure(720, 330, "Sites thin what leaves them; recordings of all go into one archive")
+    figure.text(20, 26, "live: Zenoh", "bold ta", "start")
+    figure.text(190, 198, "recorded: Parquet", "bold tc", "start")
+    for n, site in enumerate(("site plant1", "site plant2")):
+        y = 40 + 62 * n
+        figure.box(20, y, (110, 44), f"{site}\nrobots, readers", "fa")
+        figure.arrow((130, y + 22), (188, y + 22), "", "a", ">")
+        figure.box(190, y, (96, 44), "router\nfull rate", "fb")
+        figure.path(((286, y + 22), (418, 93)), "b", ">")
+    figure.text(366, 40, "uplink: 5 Hz,\nnamed streams", "s t")
+    figure.box(420, 71, (96, 44), "router\nheadquarters", "fb")
+    figure.arrow((516, 93), (574, 93), "", "a", ">")
+    figure.box(576, 71, (124, 44), "readers\nof all sites", "fa")
+    figure.path(((75, 146), (75, 214)), "c", ">")
+    figure.text(84, 172, "zstate record --archive", "code", "start")
+    figure.box(20, 216, (110, 44), "recorder\nMCAP files", "fa")
+    figure.arrow((130, 238), (188, 238), "", "c", ">")
+    figure.box(190, 208, (196, 60), "imports\na record each, written last", "fc")
+    figure.arrow((386, 238), (424, 238), "", "c", ">")
+    figure.box(426, 208, (144, 60), "compact, daily\na file for each\nrobot and date", "fc")
+    for y, name in ((206, "Archive"), (238, "DuckDB"), (270, "Ray, Spark")):
+        figure.path(((570, 238), (608, y)), "m", ">")
+        figure.text(614, y + 4, name, "code", "start")
+    figure.caption(312, "Zenoh thins, filters and routes; Parquet, DuckDB and Ray hold and query.")
+    return figure
+
+
 def dataset() -> Figure:
     """States at the stamps of images."""
     figure = Figure(720, 190, "Joint samples, images, and the state at each image")
@@ -692,7 +721,8 @@ def foxglove() -> Figure:
 
 
 FIGURES: Sequence[Callable[[], Figure]] = (
-    *(archive, arrays, camera, chain, dataset, drivers, driving, ellipse, foxglove, lidar, network),
+    *(archive, arrays, camera, chain, dataset, drivers, driving, ellipse, fleet),
+    *(foxglove, lidar, network),
     *(odometry_sources, panels),
     *(
         pose_in_odom,

@@ -3,8 +3,8 @@
 A recording of ``robot`` at 1 kHz, joint states without transforms, is imported. Then a synthetic archive is
 made of ``robots`` for ``days``, ``seconds`` a day at ``rate`` samples a second, an import for each robot and
 day. Poses of the last link in the first are looked up at ``poses`` stamps between the samples, evenly over
-all robots and days. Files may be in the page cache; the first of the times is with nothing read by this
-process.
+all robots and days; then it is compacted. Files may be in the page cache; the first of the times is with
+nothing read by this process.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from bench.micro.form import Row
 from zstate import Archive, load_model
-from zstate.archive import import_recording
+from zstate.archive import compact, import_recording
 from zstate.archive.importer import SampleTable, listed
 from zstate.archive.layout import (
     FRAMES,
@@ -70,6 +70,8 @@ def measure(
         size = sum(path.stat().st_size for path in Path(url).rglob("*") if path.is_file())
         yield Row("synthetic archive", "MB", [size / 1e6])
         yield from lookup_rows(url, model, robots=robots, days=days, span_ns=round(seconds * S), poses=poses)
+        yield from sql_rows(url)
+        yield Row("compaction", "s", [seconds_of(lambda: compact(url))])
         yield from sql_rows(url)
 
 
@@ -132,7 +134,10 @@ def make_archive(
                         [row | dict.fromkeys(POSE)],
                     ),
                     f"{folder_of(MODELS)}/{model.digest}{SUFFIX}": (model_schema(), [described]),
-                    f"{folder_of(WRITERS, robot)}/{name}{SUFFIX}": (writers_schema(), []),
+                    f"{folder_of(WRITERS, robot)}/{name}{SUFFIX}": (
+                        writers_schema(),
+                        [{"import": name, "stream": JOINTS, "messages": samples}],
+                    ),
                     f"{folder_of(IMPORTS)}/{name}{SUFFIX}": (record_schema(), [one | facts for one in rows]),
                 }
                 for path, (schema, content) in tables.items():

@@ -135,6 +135,22 @@ def test_lookups_equal_those_of_the_recording_after_an_import_in_parts(tmp_path:
     assert [one.recording for one in archive.coverage("arm")] == ["0.mcap", "1.mcap", "2.mcap"]
 
 
+def test_a_window_has_the_recordings_of_all_dates_from_its_first_to_its_last(tmp_path: Path):
+    stamps = [MIDNIGHT + hours * 3600 * S for hours in range(6, 126, 12)]  # two a day
+    for day in range(5):
+        with RecordingBuilder(tmp_path / f"{day}.mcap", "arm") as builder:
+            builder.describe("arm", at=stamps[2 * day])
+            for stamp in stamps[2 * day : 2 * day + 2]:
+                builder.joints("arm", stamp, swing_positions(stamp / 1e13))
+        import_recording(str(tmp_path / "a"), tmp_path / f"{day}.mcap")
+    archive = Archive(str(tmp_path / "a"))
+    assert archive.joint_states("arm", stamps[0], stamps[-1] + 1).stamps.tolist() == stamps
+    buffer = archive.buffer("arm", stamps[0], stamps[-1])
+    expected, valid = archive.lookup_many("world", "tool", stamps, robot="arm")
+    assert valid.all()
+    assert np.array_equal(buffer.lookup_many("world", "tool", stamps)[0], expected)
+
+
 def test_lookups_equal_those_of_a_bag_whose_nodes_share_an_edge(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("zstate.archive.importer._MESSAGES", 100)
     with Bag(tmp_path / "bag") as bag:

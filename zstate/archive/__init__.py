@@ -7,14 +7,17 @@ from zstate._util.lazy_names import lazy_names
 if TYPE_CHECKING:
     from zstate.archive.archive import Archive, ArchivedMessage, Coverage
     from zstate.archive.batches import PoseColumns, poses
+    from zstate.archive.compaction import CompactionReport, compact
     from zstate.archive.importer import ImportReport, import_recording
 
 __all__ = [
     "Archive",
     "ArchivedMessage",
+    "CompactionReport",
     "Coverage",
     "ImportReport",
     "PoseColumns",
+    "compact",
     "import_recording",
     "poses",
 ]
@@ -22,6 +25,8 @@ __all__ = [
 _HOMES = {
     "Archive": "archive",
     "ArchivedMessage": "archive",
+    "CompactionReport": "compaction",
+    "compact": "compaction",
     "Coverage": "archive",
     "ImportReport": "importer",
     "import_recording": "importer",

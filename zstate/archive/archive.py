@@ -19,18 +19,19 @@ two recordings of the same time         one history; of samples with one stamp t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.archive.files import Entry, Files, Groups, Stamps, in_threads
-from zstate.archive.layout import EDGES, JOINTS, PARTS, POSE, SUFFIX, WRITERS, folder_of, value_of
+from zstate.archive.files import Files, Groups, Stamps
+from zstate.archive.layout import EDGES, JOINTS, PARTS, POSE, WRITERS, folder_of, value_of
+from zstate.archive.ledger import Entry, compacted_stem, newest_compaction
 from zstate.archive.scene import Scene, Track
-from zstate.archive.storage import Store, arrow
+from zstate.archive.storage import Store, arrow, in_threads
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput, LookupFailed, MessageError
@@ -42,6 +43,8 @@ from zstate.wire.native import decode
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
+
+T = TypeVar("T")
 
 _MAX_ROWS = 300_000
 """Samples of one track in memory of one thread of ``lookup_many``, unless one stamp needs more."""
@@ -130,19 +133,20 @@ class Archive:
 
     def robots(self) -> tuple[str, ...]:
         """The robots of the archive, by name."""
-        complete = set(self._files.imports())
-        folders = self._files.store.folders(folder_of(WRITERS))
-        names = [value_of(folder) for folder in folders]
-        return tuple(sorted(name for name in names if complete & set(self._imports_of(name))))
+        return self._repeated(self._robots)
+
+    def _robots(self) -> tuple[str, ...]:
+        complete = {*self._files.ledger.recorded_names(), compacted_stem(self._files.ledger.number)}
+        names = map(value_of, self._files.store.folders(folder_of(WRITERS)))
+        return tuple(sorted(name for name in names if complete & set(self._files.writers_of(name))))
 
     def coverage(self, robot: str) -> tuple[Coverage, ...]:
         """What each recording has of ``robot``, by the first stamp."""
         self._check_robot(robot)
         found: list[Coverage] = []
         by_import: dict[str, list[Entry]] = {}
-        for one in self._files.records(self._imports_of(robot)):
-            if one.robot == robot:
-                by_import.setdefault(one.name, []).append(one)
+        for one in self._repeated(lambda: self._files.records(robot, self._files.imports_of(robot))):
+            by_import.setdefault(one.name, []).append(one)
         for entries in by_import.values():
             if entries:
                 rows: Counter[str] = Counter()
@@ -159,7 +163,9 @@ class Archive:
         archive. Raises InvalidInput if the model or a static edge changes in between, and without any
         recording.
         """
-        stamps = _window(start, end)
+        return self._repeated(lambda: self._window_buffer(robot, _window(start, end)))
+
+    def _window_buffer(self, robot: str, stamps: Stamps) -> TransformBuffer:
         segment = self._only_segment(robot, stamps)
         groups = {
             track: self._files.groups(entries, stamps, between=True)
@@ -173,7 +179,10 @@ class Archive:
 
         Raises as ``buffer``.
         """
-        stamps = _window(start, end)
+        return self._repeated(lambda: self._window_joint_states(robot, _window(start, end)))
+
+    def _window_joint_states(self, robot: str, stamps: Stamps) -> JointHistory:
+        start, end = stamps.tolist()
         segment = self._only_segment(robot, stamps)
         scene = segment.scene
         if scene.parts:
@@ -217,12 +226,19 @@ class Archive:
         instants, order = check_stamps(stamps), None
         if not (np.diff(instants) > 0).all():
             instants, order = np.unique(instants, return_inverse=True)
+        poses, valid = self._repeated(lambda: self._poses(target, source, instants, robot))
+        return (poses, valid) if order is None else (poses[order], valid[order])
+
+    def _poses(
+        self, target: str, source: str, instants: Stamps, robot: str
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The poses at ascending ``instants``."""
         poses, valid = np.full((len(instants), 7), np.nan), np.zeros(len(instants), np.bool_)
         if not len(instants):
             return poses, valid
         failure: LookupFailed | None = None
         is_known = False
-        for segment in self._segments(robot, self._files.around(robot, _LOOKED_UP, instants)):
+        for segment in self._segments(robot, self._files.around(robot, _LOOKED_UP, instants, between=False)):
             tracks = segment.tracks()
             edges = self._edges(segment)
             try:
@@ -247,7 +263,7 @@ class Archive:
             in_threads(look_up, self._parts(chosen, instants))
         if failure is not None and not is_known:
             raise failure
-        return (poses, valid) if order is None else (poses[order], valid[order])
+        return poses, valid
 
     def messages(self, robot: str, stream: str, start: int, end: int) -> Iterator[ArchivedMessage]:
         """The messages of ``stream`` of ``robot`` with stamps in ``[start, end)`` [ns], as recorded.
@@ -257,15 +273,12 @@ class Archive:
         kind = stream_named(stream).type
         self._check_robot(robot)
         stamps = _window(start, end)
-        entries = [one for one in self._files.around(robot, [stream], stamps) if one.stream == stream]
-        entries.sort(key=lambda one: (one.recorded, one.name))
-        for name in dict.fromkeys(one.name for one in entries):
-            groups = self._files.groups([one for one in entries if one.name == name], stamps, between=True)
-            columns = ("stamp", "log_time", "number", "name", "encoding", "message")
-            tables = [self._files.read(group, columns) for group in groups]
-            if not tables:
+        entries = self._repeated(lambda: self._files.around(robot, [stream], stamps, between=True))
+        entries.sort(key=lambda one: one.order[:2])
+        for name in dict.fromkeys(one.name for one in entries if one.stream == stream):
+            table = self._repeated(partial(self._messages_of, robot, stream, name, stamps))
+            if table is None:
                 continue
-            table = arrow().concat_tables(tables).sort_by("number")
             for row in table.to_pylist():
                 if start <= row["stamp"] < end:
                     try:
@@ -274,18 +287,39 @@ class Archive:
                         raise InvalidInput(f"{stream} of {robot!r}: {error}") from None
                     yield ArchivedMessage(row["name"], message, row["log_time"])
 
+    def _messages_of(self, robot: str, stream: str, name: str, stamps: Stamps) -> Any:
+        """The messages of one import in their order, a pyarrow.Table; None without any."""
+        entries = [one for one in self._files.records(robot, [name]) if one.stream == stream]
+        columns = ("stamp", "log_time", "number", "name", "encoding", "message")
+        groups = self._files.groups(entries, stamps, between=True)
+        tables = [self._files.read(one, columns) for one in groups]
+        return arrow().concat_tables(tables).sort_by("number") if tables else None
+
     def duckdb(self) -> DuckDBPyConnection:
         """A DuckDB connection with views of the archive, and ``zstate_pose``; see ``zstate.archive.sql``."""
         from zstate.archive.sql import connect  # noqa: PLC0415 - an extra
 
-        return connect(self._files.store, partial(lookup_rows, self))
+        return self._repeated(lambda: connect(self._files.store, partial(lookup_rows, self)))
 
-    def _imports_of(self, robot: str) -> list[str]:
-        names = self._files.store.names(folder_of(WRITERS, robot))
-        return [name.removesuffix(SUFFIX) for name in names]
+    def _repeated(self, call: Callable[[], T]) -> T:
+        """The result of ``call``; again if `compact` has replaced files meanwhile, which it may miss."""
+        while True:
+            number = self._files.refresh()
+            try:
+                result = call()
+            except Exception:  # also those of DuckDB
+                if newest_compaction(self._files.store) == number:
+                    raise
+            else:
+                if newest_compaction(self._files.store) == number:
+                    return result
+
+    def _has(self, robot: str) -> bool:
+        ledger, stems = self._files.ledger, self._files.writers_of(robot)
+        return compacted_stem(ledger.number) in stems or any(map(ledger.has_record, stems))
 
     def _check_robot(self, robot: str) -> None:
-        if not any(map(self._files.is_complete, self._imports_of(robot))):
+        if not self._repeated(partial(self._has, robot)):
             known = ", ".join(map(repr, self.robots())) or "none"
             raise InvalidInput(f"the archive {self.url!r} has no robot {robot!r}; its robots: {known}")
 
@@ -293,7 +327,7 @@ class Archive:
         """``entries`` by the frames that were in effect, in the order of the recordings."""
         segments: list[_Segment] = []
         last = ""
-        for entry in sorted(entries, key=lambda one: (one.recorded, one.name, one.first)):
+        for entry in sorted(entries, key=lambda one: one.order):
             if entry.frames != last or not segments:
                 last = entry.frames
                 if (robot, last) not in self._scenes:
@@ -305,7 +339,7 @@ class Archive:
     def _only_segment(self, robot: str, stamps: Stamps) -> _Segment:
         self._check_robot(robot)
         first, last = int(stamps[0]), int(stamps[-1])
-        segments = self._segments(robot, self._files.around(robot, _LOOKED_UP, stamps))
+        segments = self._segments(robot, self._files.around(robot, _LOOKED_UP, stamps, between=True))
         inside = [one for one in segments if one.first <= last and one.last >= first]
         if len(inside) > 1:
             changes = ", ".join(str(one.first) for one in inside[1:])
@@ -329,7 +363,7 @@ class Archive:
         return [(parent, child) for child, parent in parents.items()]
 
     def _parent(self, entry: Entry) -> str:
-        footer = self._files.footer(entry)
+        footer = self._files.footer(entry.path)
         group = footer.row_group(0)
         return group.column(footer.schema.names.index("parent")).statistics.min
 
@@ -386,7 +420,7 @@ class Archive:
     def _table(self, groups: Sequence[Groups], columns: Sequence[str] | None) -> Any:
         """The rows of ``groups`` by ascending stamps, each stamp once; None without any."""
         pa = arrow()
-        ordered = sorted(groups, key=lambda one: (one.entry.recorded, one.entry.name, one.entry.first))
+        ordered = sorted(groups, key=lambda one: one.piece.entries[0].order)
         tables = self._files.read_all(ordered, columns)
         if not tables:
             return None
@@ -394,9 +428,22 @@ class Archive:
         stamps = table.column("stamp").to_numpy()
         if (np.diff(stamps) > 0).all():
             return table
+        parts = [part for one, table in zip(ordered, tables, strict=True) for part in _by_entry(one, table)]
+        parts.sort(key=lambda part: part[0].order)
+        table = pa.concat_tables([part for _, part in parts], promote_options="default")
+        stamps = table.column("stamp").to_numpy()
         order = np.argsort(stamps, kind="stable")
         is_last = np.append(np.diff(stamps[order]) > 0, True)
         return table.take(pa.array(order[is_last]))
+
+
+def _by_entry(groups: Groups, table: Any) -> Iterator[tuple[Entry, Any]]:
+    """The rows of each import in the ``table`` of samples that was read of ``groups``."""
+    stamps = table.column("stamp").to_numpy()
+    for entry in groups.piece.entries:
+        first, last = stamps.searchsorted(entry.first), stamps.searchsorted(entry.last, "right")
+        if first < last:
+            yield entry, table.slice(first, last - first)
 
 
 def _window(start: int, end: int) -> Stamps:

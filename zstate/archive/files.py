@@ -5,60 +5,43 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.archive.layout import (
-    IMPORTS,
-    SUFFIX,
-    check_version,
-    cuts_by_date,
-    folder_of,
-    value_of,
-)
+from zstate.archive.layout import SUFFIX, WRITERS, check_version, cuts_by_date, folder_of, value_of
+from zstate.archive.ledger import Entry, Ledger, newest_compaction
 from zstate.archive.storage import Store, arrow
 
 Stamps = NDArray[np.int64]
-T = TypeVar("T")
-R = TypeVar("R")
-
-_REQUESTS = 16
-"""To an object store at once."""
 
 _ROWS_FOR_THREADS = 100_000
 """Rows of one file of which several columns are decoded at once."""
 
 
-class Entry(NamedTuple):
-    """A file of samples, as the import ``name`` of a recording lists it.
+class Piece(NamedTuple):
+    """A file, and its samples of some imports, which are consecutive ``entries`` of the ledger."""
 
-    ``frames`` is the digest of the static edges and the model that were in effect, ``recorded`` the first log
-    time [ns] of the recording.
-    """
-
-    name: str
     path: str
-    stream: str
-    robot: str
-    date: str
-    key: str
-    rows: int
-    first: int
-    last: int
-    frames: str
-    recorded: int
-    recording: str
+    entries: Sequence[Entry]
+
+    @property
+    def first(self) -> int:
+        """The first stamp [ns]."""
+        return min(one.first for one in self.entries)
+
+    @property
+    def last(self) -> int:
+        """The last stamp [ns]."""
+        return max(one.last for one in self.entries)
 
 
 class Groups(NamedTuple):
-    """Row groups of one file to read."""
+    """Row groups to read of the file of one ``piece``."""
 
-    entry: Entry
+    piece: Piece
     numbers: list[int]
     rows: int
 
@@ -68,116 +51,130 @@ class Files:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._records: dict[str, tuple[Entry, ...]] = {}
+        self.ledger = Ledger(store)
         self._footers: dict[str, Any] = {}
 
-    def imports(self) -> list[str]:
-        """The names of all complete imports."""
-        return [name.removesuffix(SUFFIX) for name in self.store.names(folder_of(IMPORTS))]
+    def refresh(self) -> int:
+        """Read the ledger again if there was a compaction; its number."""
+        number = newest_compaction(self.store)
+        if number != self.ledger.number:
+            self.ledger = Ledger(self.store, number)
+        return number
 
-    def is_complete(self, name: str) -> bool:
-        """Whether the import ``name`` is complete."""
-        return self.store.has(f"{folder_of(IMPORTS)}/{name}{SUFFIX}")
+    def imports_of(self, robot: str) -> set[str]:
+        """The imports, complete or not, with files or writers of a robot."""
+        return {*self.ledger.compacted(robot), *self.writers_of(robot)}
 
-    def record(self, name: str) -> tuple[Entry, ...]:
-        """The files of the import ``name``; none if it is not complete."""
-        if name not in self._records:
-            if not self.is_complete(name):
-                return ()
-            rows = self.table(f"{folder_of(IMPORTS)}/{name}{SUFFIX}").to_pylist()
-            known = Entry._fields[1:]
-            self._records[name] = tuple(Entry(name, *(row[field] for field in known)) for row in rows)
-        return self._records[name]
+    def writers_of(self, robot: str) -> list[str]:
+        """The imports and compactions, complete or not, with a table of writers of a robot."""
+        names = self.store.names(folder_of(WRITERS, robot))
+        return [name.removesuffix(SUFFIX) for name in names]
 
-    def records(self, names: Sequence[str]) -> list[Entry]:
-        """The files of all these imports."""
-        self._in_threads(self.record, [name for name in names if name not in self._records])
-        return [one for name in names for one in self.record(name)]
-
-    def table(self, path: str) -> Any:
-        """A table that fits into memory, a pyarrow.Table."""
-        with self.store.opened(path) as file:
-            opened = arrow().parquet.ParquetFile(file, page_checksum_verification=True)
-            check_version(opened.metadata.metadata, self.store.where(path))
-            return opened.read(use_threads=False)
+    def records(self, robot: str, names: Iterable[str]) -> list[Entry]:
+        """The files of ``robot`` that these imports have added."""
+        return self.ledger.of_robot(robot, names)
 
     def dates(self, stream: str, robot: str) -> list[str]:
         """The dates with samples of a robot."""
         return [value_of(name) for name in self.store.folders(folder_of(stream, robot))]
 
-    def around(self, robot: str, streams: Iterable[str], stamps: Stamps) -> list[Entry]:
-        """All files of the imports with files on the dates of ascending ``stamps``, or next to these."""
+    def around(self, robot: str, streams: Iterable[str], stamps: Stamps, *, between: bool) -> list[Entry]:
+        """All files of the imports with files on the dates of ascending ``stamps``, or next to these.
+
+        With ``between`` also those on all dates from the first to the last of the stamps.
+        """
         wanted = np.array([day for day, _ in cuts_by_date(stamps)])
         names: set[str] = set()
+        compacted: set[tuple[str, str]] = set()
         for stream in streams:
             dates = np.array(self.dates(stream, robot), str)
             at, after = dates.searchsorted(wanted), dates.searchsorted(wanted, "right")
             chosen = {*at.tolist(), *(at - 1).tolist(), *after.tolist()}
-            for number in sorted(one for one in chosen if 0 <= one < len(dates)):
-                files = self.store.names(folder_of(stream, robot, str(dates[number])))
+            if between:
+                chosen |= {*range(int(at[0]), int(after[-1]))}
+            for day in (str(dates[one]) for one in sorted(chosen) if 0 <= one < len(dates)):
+                files = self.store.names(folder_of(stream, robot, day))
                 names |= {file.partition(".")[0] for file in files if file.endswith(SUFFIX)}
-        return [one for one in self.records(sorted(names)) if one.robot == robot]
+                compacted.add((stream, day))
+        for name, entries in self.ledger.compacted(robot).items():
+            if any((one.stream, one.date) in compacted for one in entries):
+                names.add(name)
+        return self.records(robot, sorted(names))
 
     def groups(self, entries: Sequence[Entry], stamps: Stamps, *, between: bool) -> list[Groups]:
         """The row groups of files of one key with the samples around each of ascending ``stamps``.
 
         With ``between`` also all samples from the first to the last of the stamps.
         """
-        chosen = _needed([(one.first, one.last) for one in entries], stamps, between=between)
-        entries = [entries[number] for number in chosen]
+        by_path: dict[str, list[Entry]] = {}
+        for one in entries:
+            by_path.setdefault(one.path, []).append(one)
+        pieces = [Piece(path, ordered) for path, ordered in by_path.items()]
+        chosen = _needed([(one.first, one.last) for one in pieces], stamps, between=between)
+        pieces = [pieces[number] for number in chosen]
         spans: list[tuple[int, int]] = []
-        places: list[tuple[int, int]] = []
-        self._in_threads(self.footer, [one for one in entries if one.path not in self._footers])
-        for number, entry in enumerate(entries):
-            footer = self.footer(entry)
+        places: list[tuple[int, int, int]] = []
+        self.store.in_threads(self.footer, [one.path for one in pieces if not self._has_one_group(one)])
+        for number, piece in enumerate(pieces):
+            if self._has_one_group(piece):
+                spans.append((piece.first, piece.last))
+                places.append((number, 0, sum(one.rows for one in piece.entries)))
+                continue
+            footer = self.footer(piece.path)
             column = footer.schema.names.index("stamp")
             for group in range(footer.num_row_groups):
-                statistics = footer.row_group(group).column(column).statistics
-                spans.append((statistics.min, statistics.max))
-                places.append((number, group))
-        by_file: dict[int, list[int]] = {}
+                about = footer.row_group(group)
+                statistics = about.column(column).statistics
+                first, last = max(statistics.min, piece.first), min(statistics.max, piece.last)
+                if first <= last:
+                    spans.append((first, last))
+                    places.append((number, group, about.num_rows))
+        found: dict[int, Groups] = {}
         for one in _needed(spans, stamps, between=between):
-            number, group = places[one]
-            by_file.setdefault(number, []).append(group)
-        found: list[Groups] = []
-        for number, numbers in by_file.items():
-            footer = self.footer(entries[number])
-            rows = sum(footer.row_group(group).num_rows for group in numbers)
-            found.append(Groups(entries[number], numbers, rows))
-        return found
+            number, group, rows = places[one]
+            before = found.get(number, Groups(pieces[number], [], 0))
+            found[number] = Groups(before.piece, [*before.numbers, group], before.rows + rows)
+        return list(found.values())
 
-    def footer(self, entry: Entry) -> Any:
+    def _has_one_group(self, piece: Piece) -> bool:
+        return piece.entries[0].groups == 1 and piece.path not in self._footers
+
+    def footer(self, path: str) -> Any:
         """The metadata of a file. Raises RecordingError for one that cannot be read."""
-        if entry.path not in self._footers:
-            with self.store.opened(entry.path) as file:
+        if path not in self._footers:
+            with self.store.opened(path) as file:
                 footer = arrow().parquet.read_metadata(file)
-            check_version(footer.metadata, self.store.where(entry.path))
-            self._footers[entry.path] = footer
-        return self._footers[entry.path]
+            check_version(footer.metadata, self.store.where(path))
+            self._footers[path] = footer
+        return self._footers[path]
 
     def read_all(self, groups: Sequence[Groups], columns: Sequence[str] | None = None) -> list[Any]:
         """The rows of each of ``groups``."""
-        return self._in_threads(lambda one: self.read(one, columns), groups)
-
-    def _in_threads(self, call: Callable[[T], R], arguments: Sequence[T]) -> list[R]:
-        """``in_threads``, with more of them for an object store, which takes a while for each file."""
-        return in_threads(call, arguments, None if self.store.is_local else _REQUESTS)
+        return self.store.in_threads(lambda one: self.read(one, columns), groups)
 
     def read(self, groups: Groups, columns: Sequence[str] | None = None) -> Any:
         """The rows of ``groups``, a pyarrow.Table; of ``columns`` those that the file has."""
-        footer = self.footer(groups.entry)
-        with self.store.opened(groups.entry.path) as file:
+        path, piece = groups.piece.path, groups.piece
+        with self.store.opened(path) as file:
             opened = arrow().parquet.ParquetFile(
                 file,
-                metadata=footer,
+                metadata=self._footers.get(path),
                 page_checksum_verification=True,
                 pre_buffer=not self.store.is_local,  # then one request reads what is close together
             )
+            if path not in self._footers:
+                check_version(opened.metadata.metadata, self.store.where(path))
             if columns is not None:
                 known = opened.schema_arrow.names
                 columns = [name for name in columns if name in known]
             is_large = groups.rows >= _ROWS_FOR_THREADS
-            return opened.read_row_groups(groups.numbers, columns=columns, use_threads=is_large)
+            table = opened.read_row_groups(groups.numbers, columns=columns, use_threads=is_large)
+        compute, stamps = arrow().compute, table.column("stamp")
+        ends = compute.min_max(stamps).as_py()
+        if ends["min"] < piece.first or ends["max"] > piece.last:  # samples of other imports
+            after = compute.greater_equal(stamps, piece.first)
+            return table.filter(compute.and_(after, compute.less_equal(stamps, piece.last)))
+        return table
 
 
 def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) -> list[int]:
@@ -205,14 +202,3 @@ def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) 
     is_needed[by_last[before[before >= 0]]] = True
     is_needed[by_first[after[after < len(firsts)]]] = True
     return np.flatnonzero(is_needed).tolist()
-
-
-def in_threads(call: Callable[[T], R], arguments: Sequence[T], threads: int | None = None) -> list[R]:
-    """The results of ``call`` for each argument, in their order, by so many ``threads``.
-
-    By default there is one for each processor: Parquet is decoded without the lock of the interpreter.
-    """
-    if len(arguments) < 2:
-        return [call(one) for one in arguments]
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        return list(pool.map(call, arguments))

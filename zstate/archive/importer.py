@@ -27,7 +27,6 @@ from zstate._util.refusals import Refusals
 from zstate.archive.layout import (
     EDGES,
     FRAMES,
-    IMPORTS,
     JOINTS,
     MODELS,
     PARTS,
@@ -44,6 +43,7 @@ from zstate.archive.layout import (
     write_small,
     writers_schema,
 )
+from zstate.archive.ledger import Ledger, record_path
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.joint_samples import track_samples
@@ -83,6 +83,7 @@ _PROGRESS = 50_000
 _WAITING_BYTES = 64_000_000
 """Bytes of records of all robots after which all are decoded."""
 
+_LISTED = ("stream", "robot", "date", "key", "rows", "first", "last", "groups", "columns")
 _ROBOTS = 32
 """Robots for which a recording is read once: each has row groups in memory."""
 
@@ -143,8 +144,7 @@ def _import_part(store: Store, path: Path, on_progress: Callable[[str], object])
             )
             raise RecordingError(f"{text}; {advice}", path=str(path))
         name = file_digest(storage.path for storage in reader.storages)
-        record = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
-        if store.has(record):
+        if _has_all(store, name):
             return ImportReport(path, is_known=True)
         refusals = Refusals(f"recorded messages of {path.name!r}")
         decoded = DecodedRecording(reader, refusals.count)
@@ -160,9 +160,10 @@ def _import_part(store: Store, path: Path, on_progress: Callable[[str], object])
                 for one in reading.robots:
                     rows += listed(one.files, one.scene, pending, name)
                     pending |= one.small_files(store, name)
+            imported = time.time_ns()
             for row in rows:
                 row |= {"recording": path.name, "recorded": reader.span[0] if reader.span else 0}
-                row["imported"] = time.time_ns()
+                row["imported"] = imported
                 report.rows[row["stream"]] += row["rows"]
                 report.size += row["bytes"]
             report.files = len(rows)
@@ -171,8 +172,16 @@ def _import_part(store: Store, path: Path, on_progress: Callable[[str], object])
                 store.put(staged, target)
             staged = new_path.__next__()
             write_small(staged, record_schema(), rows)
-            store.put(staged, record)  # the import counts from now on
+            store.put(staged, record_path(name))  # the import counts from now on
     return report
+
+
+def _has_all(store: Store, name: str) -> bool:
+    """Whether the import ``name`` is complete, and none of its files was lost or removed since."""
+    ledger = Ledger(store)
+    if not ledger.is_complete(name):
+        return False
+    return all(store.has(path) for path in {one.path for one in ledger.files_of(name)})
 
 
 def listed(
@@ -186,9 +195,8 @@ def listed(
             "path": path,
             "bytes": file.staged.stat().st_size,
             "frames": scene,
-            **{
-                one: getattr(file, one) for one in ("stream", "robot", "date", "key", "rows", "first", "last")
-            },
+            "import": name,
+            **{one: getattr(file, one) for one in _LISTED},
         }
 
 

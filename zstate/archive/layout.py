@@ -17,13 +17,15 @@ folder                                         a row
 ``writers/robot=R/``                           a writer of a recording, and the number of its messages
 ``models/``                                    a model by its ``digest``, with its ``urdf``
 ``imports/``                                   a file that the import of a recording has added
+``compacted/``                                 the same of many imports (``zstate.archive.ledger``)
 =============================================  =======================================================
 
 ``date`` is the UTC date of the stamps. Rows are sorted by stamp [ns]; those of messages within row groups. A
 file of samples has one edge, or the joints of one writer, of one recording, and is named
 ``IMPORT.DIGEST.parquet``: by the digest of the recording, and that of its own bytes. It counts once
-``imports/IMPORT.parquet`` lists it, which is written last. ``message`` is the payload of the native
-wire (docs/wire.md), of the type in ``encoding``. The metadata of each file have the version of this layout.
+``imports/IMPORT.parquet`` lists it, which is written last. ``compacted-N.DIGEST.parquet`` has the samples of
+several recordings, one after the other. ``message`` is the payload of the native wire (docs/wire.md), of the
+type in ``encoding``. The metadata of each file have the version of this layout.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
@@ -31,6 +33,7 @@ wire (docs/wire.md), of the type in ``encoding``. The metadata of each file have
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, date, datetime
 from functools import cache
@@ -51,7 +54,9 @@ VERSION_KEY = b"zstate.archive"
 KEY = b"zstate.key"
 """Metadata key of what a file of samples is of: the child of an edge, or the names of a driver's joints."""
 
-IMPORTS, MODELS, FRAMES, WRITERS = TABLES = ("imports/", "models/", "frames/", "writers/")
+IMPORTS, COMPACTED, MODELS, FRAMES, WRITERS = TABLES = (
+    *("imports/", "compacted/", "models/", "frames/", "writers/"),
+)
 JOINTS, PARTS, EDGES = "joint_states", "partial_joint_states", "transforms"
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 SUFFIX = ".parquet"
@@ -101,10 +106,10 @@ def cuts_by_date(stamps: NDArray[np.int64]) -> list[tuple[str, slice]]:
 
 @cache
 def record_schema() -> Any:
-    """The columns of ``imports``."""
+    """The columns of ``imports`` and ``compacted``: ``columns`` are those of the file, with their types."""
     pa = arrow()
-    texts = ("path", "stream", "robot", "date", "key")
-    numbers = ("rows", "bytes", "first", "last")
+    texts = ("import", "path", "stream", "robot", "date", "key", "columns")
+    numbers = ("rows", "bytes", "first", "last", "groups")
     return pa.schema(
         [
             *((name, pa.string()) for name in texts),
@@ -168,6 +173,8 @@ class WrittenFile(NamedTuple):
     rows: int
     first: int
     last: int
+    groups: int
+    columns: str
     digest: str
 
 
@@ -181,6 +188,7 @@ class TableFile:
         self._pending: list[Any] = []
         self._pending_rows = self._pending_bytes = self._groups = self._rows = 0
         self._first, self._last = (1 << 63) - 1, -(1 << 63)
+        self._columns = ""
 
     @property
     def is_full(self) -> bool:
@@ -213,6 +221,7 @@ class TableFile:
             key = self._head[-1]
             metadata = {VERSION_KEY: str(VERSION).encode(), KEY: key.encode()}
             dictionary, encodings = _encodings(table)
+            self._columns = json.dumps({field.name: str(field.type) for field in table.schema})
             self._writer = arrow().parquet.ParquetWriter(
                 self.path,
                 table.schema.with_metadata(metadata),
@@ -228,7 +237,8 @@ class TableFile:
         if self._pending:
             self._write_groups(self._pending_rows)
         self._writer.close()
-        return WrittenFile(*self._head, self._rows, self._first, self._last, file_digest([self.path]))
+        facts = self._rows, self._first, self._last, self._groups, self._columns
+        return WrittenFile(*self._head, *facts, file_digest([self.path]))
 
     def abandon(self) -> None:
         """Remove the file."""
@@ -263,8 +273,10 @@ def _encodings(table: Any) -> tuple[list[str], dict[str, str]]:
     return dictionary, encodings
 
 
-def write_small(path: Path, schema: Any, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write a table that fits into memory."""
+def write_small(
+    path: Path, schema: Any, rows: Sequence[Mapping[str, object]], per_group: int | None = None
+) -> None:
+    """Write a table that fits into memory, with so many rows in a row group."""
     pa = arrow()
     table = pa.Table.from_pylist(list(rows), schema=schema)
-    pa.parquet.write_table(table, path, compression="zstd", write_page_checksum=True)
+    pa.parquet.write_table(table, path, per_group, compression="zstd", write_page_checksum=True)

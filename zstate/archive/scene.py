@@ -47,14 +47,16 @@ class Scene:
         model: RobotModel | None = None
         statics: list[tuple[Transform, str | None]] = []
         parts: dict[str, str] = {}
-        for row in files.table(f"{folder_of(FRAMES, robot)}/{digest}{SUFFIX}").to_pylist():
+        for row in files.ledger.table(f"{folder_of(FRAMES, robot)}/{digest}{SUFFIX}").to_pylist():
             if row["kind"] == "static":
                 pose = tuple(row[name] for name in POSE)
                 edge = Transform.trusted(row["parent"], row["child"], pose, None, "static")
                 statics.append((edge, row["writer"]))
             elif row["kind"] == "model":
                 ((urdf,),) = (
-                    files.table(f"{folder_of(MODELS)}/{row['model']}{SUFFIX}").column("urdf").to_pylist(),
+                    files.ledger.table(f"{folder_of(MODELS)}/{row['model']}{SUFFIX}")
+                    .column("urdf")
+                    .to_pylist(),
                 )
                 model = _parsed(urdf, robot)
             else:

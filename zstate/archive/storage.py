@@ -13,12 +13,14 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from hashlib import blake2b
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from zstate.errors import LibraryMissing
 from zstate.recording.errors import RecordingError
@@ -29,7 +31,14 @@ STAGING = ".import-"
 _DIGEST_BYTES = 16
 _CHUNK = 1 << 20
 
+_REQUESTS = 16
+"""To an object store at once."""
 
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@cache
 def arrow() -> Any:
     """The module pyarrow, with the parts that archives use. Raises LibraryMissing."""
     try:
@@ -144,6 +153,10 @@ class Store:
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
+    def in_threads(self, call: Callable[[T], R], arguments: Sequence[T]) -> list[R]:
+        """``in_threads``, with more of them for an object store, which takes a while for each file."""
+        return in_threads(call, arguments, None if self.is_local else _REQUESTS)
+
     def _infos(self, folder: str, *, recursive: bool = False) -> Sequence[Any]:
         fs = arrow().fs
         selector = fs.FileSelector(self._full(folder), allow_not_found=True, recursive=recursive)
@@ -165,6 +178,17 @@ class Store:
             raise RecordingError(f"{where!r} is no file of an archive: {error}", path=where) from error
         except OSError as error:
             raise RecordingError(f"{where!r}: {error.strerror or error}", path=where) from error
+
+
+def in_threads(call: Callable[[T], R], arguments: Sequence[T], threads: int | None = None) -> list[R]:
+    """The results of ``call`` for each argument, in their order, by so many ``threads``.
+
+    By default there is one for each processor: Parquet is decoded without the lock of the interpreter.
+    """
+    if len(arguments) < 2:
+        return [call(one) for one in arguments]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        return list(pool.map(call, arguments))
 
 
 def _filesystem(url: str) -> tuple[Any, str]:

@@ -26,10 +26,10 @@ class ArchiveStore:
 
     def check(self) -> None:
         """Raise LibraryMissing without pyarrow, and RecordingError for a URL that cannot be opened."""
-        from zstate.archive.files import Files  # noqa: PLC0415 - pyarrow takes time
+        from zstate.archive.ledger import Ledger  # noqa: PLC0415 - pyarrow takes time
         from zstate.archive.storage import Store  # noqa: PLC0415
 
-        Files(Store(self._url)).imports()
+        Ledger(Store(self._url)).recorded_names()
 
     def add(self, path: Path) -> None:
         """Add the recording ``path``; raises as ``import_recording``."""

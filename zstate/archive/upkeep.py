@@ -5,14 +5,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from zstate.archive.files import Entry, Files
+from zstate.archive.compaction import sweep
 from zstate.archive.layout import (
     FRAMES,
-    IMPORTS,
     MODELS,
     SUFFIX,
     TABLES,
@@ -22,10 +23,25 @@ from zstate.archive.layout import (
     record_schema,
     value_of,
     write_small,
+    writers_schema,
+)
+from zstate.archive.ledger import (
+    Entry,
+    Ledger,
+    compacted_path,
+    entries_of,
+    is_compacted,
+    record_path,
+    write_ledger,
 )
 from zstate.archive.storage import STAGING, Store, arrow, bytes_digest
 from zstate.errors import InvalidInput
 from zstate.recording.errors import RecordingError
+
+_NAMED = 3
+"""Recordings that a finding names; of more it has the number."""
+
+_REPLACED = "not used any more, as other files have its rows; `zstate archive DIR compact` removes it"
 
 
 class Finding(NamedTuple):
@@ -48,36 +64,44 @@ def check(url: str) -> Iterator[Finding]:
     A file that is found costs only itself: the rest of the archive is used.
     """
     store = Store(url)
-    files = Files(store)
-    listed: dict[str, Entry] = {}
-    for name in files.imports():
-        with suppress(RecordingError):  # it is found below
-            listed |= {one.path: one for one in files.record(name)}
-    present: set[str] = set()
-    for path, _ in store.files():
-        present.add(path)
-        if problem := _problem(files, path, listed.get(path)):
+    ledger = Ledger(store)
+    listed: dict[str, list[Entry]] = {}
+    rows = ledger.rows(skip_damaged=True)
+    for one in entries_of(rows):
+        listed.setdefault(one.path, []).append(one)
+    present = [path for path, _ in store.files()]
+    replaced: set[str] = set()
+    with suppress(RecordingError):  # its file is found below
+        replaced = {*ledger.replaced(rows, present)}
+    for path in present:
+        problem = _REPLACED if path in replaced else _problem(ledger, store, path, listed.get(path))
+        if problem:
             yield Finding(path, problem)
-    for path in sorted(listed.keys() - present):
+    for path in sorted(listed.keys() - {*present}):
         yield Finding(path, f"missing; {_repair(listed[path])}")
 
 
-def _repair(entry: Entry) -> str:
-    return f"remove {folder_of(IMPORTS)}/{entry.name}{SUFFIX} and add {entry.recording!r} again"
+def _repair(entries: Sequence[Entry]) -> str:
+    """How to get the samples of a file back once it is not there."""
+    names = sorted({one.recording for one in entries})
+    some = ", ".join(map(repr, names[:_NAMED])) + (
+        f" and {len(names) - _NAMED} more" if names[_NAMED:] else ""
+    )
+    return f"add {some} again"
 
 
-def _problem(files: Files, path: str, entry: Entry | None) -> str:
-    """What is wrong with a file, which an import lists as ``entry``; empty for nothing."""
+def _problem(ledger: Ledger, store: Store, path: str, entries: Sequence[Entry] | None) -> str:
+    """What is wrong with a file, of which ``entries`` are listed; empty for nothing."""
     top, _, name = path.partition("/")
     if top.startswith(STAGING):
-        return "left by an import that was interrupted: add its recording again, or remove the folder"
+        return "left by an import or a compaction that was interrupted: repeat it, or remove the folder"
     if path.endswith(SUFFIX):
         try:
             if f"{top}/" in TABLES:
-                files.table(path)
+                ledger.table(path)
                 return ""
             if top.startswith("stream="):
-                return _problem_of_samples(files, path, name.rpartition("/")[2], entry)
+                return _problem_of_samples(store, path, name.rpartition("/")[2], entries)
         except (RecordingError, OSError) as error:
             return f"{error}; remove it, and add its recording again"
         except ValueError:  # also ArrowInvalid
@@ -85,14 +109,15 @@ def _problem(files: Files, path: str, entry: Entry | None) -> str:
     return "not a file of an archive of zstate; move it away"
 
 
-def _problem_of_samples(files: Files, path: str, name: str, entry: Entry | None) -> str:
+def _problem_of_samples(store: Store, path: str, name: str, entries: Sequence[Entry] | None) -> str:
     _, digest, _ = name.split(".")
-    content = files.store.read(path)
-    if entry is None:
+    content = store.read(path)
+    if entries is None:
         check_version(arrow().parquet.read_metadata(arrow().BufferReader(content)).metadata, path)
         return "of an import that was interrupted: add its recording again, or remove the file"
-    is_whole = bytes_digest(content) == digest
-    return "" if is_whole else f"damaged: its bytes have another digest than its name; {_repair(entry)}"
+    if bytes_digest(content) == digest:
+        return ""
+    return f"damaged: its bytes have another digest than its name; remove it, and {_repair(entries)}"
 
 
 def expire(url: str, before: str) -> Removed:
@@ -114,23 +139,30 @@ def forget(url: str, robot: str) -> Removed:
 def _remove(url: str, is_removed: Callable[[str, str], bool]) -> Removed:
     """Remove the samples of a robot on a date for which ``is_removed`` is true: first from the imports."""
     store = Store(url)
-    files = Files(store)
-    kept: list[Entry] = []
-    doomed: list[str] = []
-    for name in files.imports():
-        path = f"{folder_of(IMPORTS)}/{name}{SUFFIX}"
-        entries = files.record(name)
-        rest = [one for one in entries if not is_removed(one.robot, one.date)]
-        kept += rest
+    ledger = Ledger(store)
+    rows = ledger.rows()
+    sweep(store, ledger, rows)
+    kept = [row for row in rows if not is_removed(row["robot"], row["date"])]
+    own, _ = ledger.counted()
+    by_import: dict[str, list[dict[str, Any]]] = {name: [] for name in own}
+    compacted: list[dict[str, Any]] = []
+    for row in kept:
+        by_import.get(row["import"], compacted).append(row)
+    changed = {row["import"] for row in rows if is_removed(row["robot"], row["date"])}
+    for name, rest in by_import.items():
         if not rest:
+            store.remove([record_path(name)])
+        elif name in changed:
+            _replace(store, record_path(name), partial(_write, record_schema(), rest))
+    if ledger.number and changed - by_import.keys():
+        path = compacted_path(ledger.number)
+        if compacted:
+            _replace(store, path, partial(write_ledger, compacted))
+        else:
             store.remove([path])
-        elif len(rest) < len(entries):
-            rows = [row for row in files.table(path).to_pylist() if not is_removed(row["robot"], row["date"])]
-            with store.staging(name) as folder:
-                write_small(folder / "record", record_schema(), rows)
-                store.put(folder / "record", path)
-    robots = {(one.name, one.robot) for one in kept}
-    scenes = {(one.robot, one.frames) for one in kept}
+    robots = {(row["import"], row["robot"]) for row in kept}
+    scenes = {(row["robot"], row["frames"]) for row in kept}
+    doomed: list[str] = []
     models: set[str] = set()
     sizes = dict(store.files())
     for path in sizes:
@@ -138,10 +170,12 @@ def _remove(url: str, is_removed: Callable[[str, str], bool]) -> Removed:
         values = [value_of(folder) for folder in folders]
         stem = name.removesuffix(SUFFIX)
         if top == folder_of(FRAMES) and (values[0], stem) in scenes:
-            models |= {row["model"] for row in files.table(path).to_pylist() if row["kind"] == "model"}
+            models |= {row["model"] for row in ledger.table(path).to_pylist() if row["kind"] == "model"}
             continue
         is_unused = top == folder_of(FRAMES)
-        is_unused |= top == folder_of(WRITERS) and (stem, values[0]) not in robots
+        if top == folder_of(WRITERS):
+            names = {name for name, robot in robots if robot == values[0]}
+            is_unused = _is_left_empty(store, ledger, path, names)
         if is_unused or (top.startswith("stream=") and len(values) == 2 and is_removed(values[0], values[1])):
             doomed.append(path)
     doomed += [
@@ -152,3 +186,26 @@ def _remove(url: str, is_removed: Callable[[str, str], bool]) -> Removed:
     ]
     store.remove(doomed)
     return Removed(len(doomed), sum(sizes[path] for path in doomed))
+
+
+def _is_left_empty(store: Store, ledger: Ledger, path: str, names: set[str]) -> bool:
+    """Whether a table of writers has none of the imports ``names``; it keeps no others."""
+    stem = path.rpartition("/")[2].removesuffix(SUFFIX)
+    if not is_compacted(stem):
+        return stem not in names
+    rows = ledger.table(path).to_pylist()
+    kept = [row for row in rows if row["import"] in names]
+    if kept and len(kept) < len(rows):
+        _replace(store, path, partial(_write, writers_schema(), kept))
+    return not kept
+
+
+def _write(schema: Any, rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    write_small(path, schema, rows)
+
+
+def _replace(store: Store, path: str, write: Callable[[Path], None]) -> None:
+    """Put what ``write`` writes into a file in place of ``path``."""
+    with store.staging(Path(path).stem) as folder:
+        write(folder / "table")
+        store.put(folder / "table", path)

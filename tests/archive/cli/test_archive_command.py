@@ -105,6 +105,8 @@ def test_upkeep_names_damaged_files_and_removes_days_and_robots(tmp_path: Path):
                 builder.joints("arm", start + n, swing_positions(n))
         assert run_cli("archive", url, "--from", str(tmp_path / f"{name}.mcap")).code == 0
     assert "as they were written" in run_cli("archive", url, "check").stdout
+    assert "2 files in place of 4" in run_cli("archive", url, "compact", "--before", "1d").stdout
+    assert "nothing to merge" in run_cli("archive", url, "compact").stdout
     assert "before 20" in run_cli("archive", url, "expire", "--before", "90d").stdout
     assert run_cli("archive", url).stdout.splitlines()[1].split()[:2] == ["arm", "1"]
     assert "no date like" in failure("archive", url, "expire", "--before", "soon", code=2)

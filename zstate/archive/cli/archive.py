@@ -71,6 +71,7 @@ def archive_command(context: click.Context, *, url: str, recordings: tuple[str, 
     zstate view fleet --robot robot17 --at 2026-11-20T14:03
     zstate archive fleet cut minute.mcap robot17 --at 2026-11-20T14:03   # for replay, info, foxglove
     zstate archive fleet check                          # checksums of all files
+    zstate archive fleet compact --before 1d            # fewer files, as each costs every query
     zstate archive fleet expire --before 90d
     zstate archive fleet forget robot17
     """
@@ -199,6 +200,32 @@ def check_command(url: str) -> None:
     if count:
         fail(f"{count_text(count, 'file')} of {url} cannot be used")
     print_wrapped(f"all files of {url} are as they were written")
+
+
+@archive_command.command("compact")
+@click.option(
+    "--before",
+    type=options.Checked("DATE", _date_before),
+    help="Samples of dates before a UTC date, or a time before today: 1d, 2w. Default: of all dates.",
+)
+@click.pass_obj
+def compact_command(url: str, *, before: str | None) -> None:
+    """Merge the files of each stream, robot and date, and what is listed of each recording.
+
+    Lookups and queries answer as before, and need less time: each file costs all of them. Recordings may be
+    added and read meanwhile; run it once a day, for the days that are over. If it is interrupted, run it
+    again. Files of recordings that overlap in time are not merged.
+
+    \b
+    zstate archive fleet compact --before 1d
+    """
+    from zstate.archive.compaction import compact
+
+    report = compact(url, before, _Progress())
+    for path, problem in report.problems.items():
+        print_wrapped(f"{path} stays as it is: {problem}")
+    written = count_text(report.written, "file")
+    print_wrapped(f"{written} in place of {report.files}" if report.written else "nothing to merge")
 
 
 @archive_command.command("expire")
