@@ -24,7 +24,7 @@ ledger has changed nothing; after it, the next one removes what is left.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count, groupby
 from pathlib import Path
@@ -72,7 +72,7 @@ class CompactionReport:
 
     files: int = 0
     written: int = 0
-    problems: dict[str, str] = field(default_factory=dict[str, str])
+    problems: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 def compact(
@@ -103,7 +103,7 @@ def compact(
             try:
                 _merge(files, run, compacted_stem(number), new_path())
             except RecordingError as error:
-                report.problems[str(error.path)] = str(error)
+                report.problems = {**report.problems, str(error.path): str(error)}
             else:
                 report.written += 1
         report.written += _merge_writers(store, own, number, new_path)
