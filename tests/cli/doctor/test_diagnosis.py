@@ -734,7 +734,7 @@ def test_a_driver_its_commander_and_the_age_of_its_commands_are_checked(sessions
     commander = program.replace("driver", "teleop", 1)
     assert f"active, commanded by {commander}" in found["driver"][1]
     assert found["commander"] == ("ok", commander)
-    assert re.fullmatch(r"the newest is [\d.]+ ms old, valid for 250.0 ms at most", found["commands"][1])
+    assert re.fullmatch(r"the newest is [\d.]+ [mun]s old, valid for 250.0 ms at most", found["commands"][1])
 
 
 def test_a_stopped_driver_is_the_broken_link_with_the_reason_and_the_release(sessions, host_driver):

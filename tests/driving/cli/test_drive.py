@@ -131,7 +131,9 @@ def test_changes_of_state_are_lines_and_the_end_is_a_report(spawn: Spawn):
     interrupted(child)
     assert " samples; commanded 100 Hz, achieved " in child.line()
     assert child.line().startswith("late by ")
-    assert child.line().endswith(" written, 0 failures of the driver, commands refused: none")
+    # A busy machine has more commands wait than a tick takes.
+    refused = child.line().partition(" written, 0 failures of the driver, commands refused: ")[2]
+    assert re.fullmatch(r"none|\d+ overrun", refused)
 
 
 @pytest.mark.processes
