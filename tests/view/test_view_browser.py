@@ -65,6 +65,12 @@ def shape_of(view_tab) -> tuple[int, int]:
     return round(box["height"]), round(box["width"])
 
 
+def docked_shape_of(view_tab) -> tuple[int, int]:
+    """The same, once the panel has taken its part of the window: the canvas has all of it before."""
+    until(lambda: shape_of(view_tab)[1] < view_tab.tab.viewport_size["width"], PATIENCE_S)
+    return shape_of(view_tab)
+
+
 def picture(view_tab) -> NDArray[np.int16]:
     """The pixels of the canvas, when four pictures in a row are the same: a page shows a change late."""
     height, width = shape_of(view_tab)
@@ -172,7 +178,7 @@ def test_axes_and_mesh_of_a_moving_link_are_of_one_instant(open_tab, show_view, 
         until(lambda: "sledge" in shown.source.models)
         view_tab = open_tab(shown.page.url)
         until_fitted(shown)
-        height, width = shape_of(view_tab)
+        height, width = docked_shape_of(view_tab)
         places: list[float] = []
         apart: list[float] = []
 
@@ -289,7 +295,7 @@ def test_map_and_scan_are_drawn_where_they_are(open_tab, show_view, sessions):
         meshes = shown.view.scene.corners(snapshot.tree, placed)
         framing = fit_camera(snapshot, placed, 1.0, meshes, corners)
         assert framing is not None
-        height, width = shape_of(view_tab)
+        height, width = docked_shape_of(view_tab)
         middles = np.array([(0.7, 0.7, 0.0), (-0.7, -0.7, 0.0), (0.7, -0.7, 0.0)])
         occupied, unknown, free = pixels_of(middles, framing, (width, height)).round().astype(int).tolist()
 
@@ -329,7 +335,7 @@ def test_cloud_is_drawn_where_it_is_and_vanishes_by_the_checkbox(open_tab, show_
         placed = snapshot.poses_in("rrbot/world")
         framing = fit_camera(snapshot, placed, 1.0, shown.view.scene.corners(snapshot.tree, placed))
         assert framing is not None
-        height, width = shape_of(view_tab)
+        height, width = docked_shape_of(view_tab)
         ((x, y),) = pixels_of(middle, framing, (width, height)).round().astype(int).tolist()
 
         def is_drawn() -> bool:
