@@ -218,6 +218,9 @@ def test_a_closed_session_ends_the_threads_of_its_subscribers():
     session = connect()
     subscriber = StreamSubscriber(session, KEY, lambda samples: None)
     session.close()
+    began = time.monotonic()
+    subscriber.finish(DEADLINE_S)
+    assert time.monotonic() - began < DEADLINE_S, "nothing is delivered any more, and nothing waited for"
     until(lambda: "zstate receiver" not in [thread.name for thread in threading.enumerate()])
     subscriber.close()
 

@@ -143,7 +143,8 @@ class Receiver(Closeable):
         self._thread.call(self._take_turn)
         delivered = threading.Event()
         self._thread.call(delivered.set)
-        delivered.wait(timeout_s)
+        if self._session.is_usable:  # else the thread has ended
+            delivered.wait(timeout_s)
 
     def close(self) -> None:
         """Stop within a second, also from inside a callback, which is not called afterwards.

@@ -64,8 +64,8 @@ _LARGE_WAITING_BYTES = 1 << 26
 _WRITES_HZ = 20.0
 # Robots that start together should be discovered together: it decides their namespaces in the file.
 _DISCOVERY_NS = 300_000_000
-# What was received is written in milliseconds, but on a machine that is busy or a disk that is slow. From
-# then on the rest is dropped; a disk that never answers keeps no program from its end.
+# What was received is written in milliseconds, except on a busy machine or a slow disk. After the first time
+# the rest is dropped; after the second the program goes on, as a disk may never answer.
 _DRAIN_S = 5.0
 _CLOSED_WITHIN_S = 8.0
 
