@@ -302,7 +302,7 @@ class Archive:
         return self._repeated(lambda: connect(self._files.store, partial(lookup_rows, self)))
 
     def _repeated(self, call: Callable[[], T]) -> T:
-        """The result of ``call``; again if `compact` has replaced files meanwhile, which it may miss."""
+        """The result of ``call``; again if `compact` has replaced files during it, which it may miss."""
         while True:
             number = self._files.refresh()
             try:

@@ -80,16 +80,16 @@ def compact(
 ) -> CompactionReport:
     """Merge the files of the archive ``url``; those of samples only of dates before the date ``before``.
 
-    New recordings may be added meanwhile, and Archives may read: they see the files from before or those from
-    after it. Nothing may remove or repair files, and no other compaction run. While it runs, merged samples
-    take their space twice. Raises RecordingError for an archive that cannot be read or written.
+    While it runs, recordings may be added, and Archives may read: they see the files from before or those
+    from after it. Nothing may remove or repair files, and no other compaction run. Merged samples take their
+    space twice until its end. Raises RecordingError for an archive that cannot be read or written.
     """
     store = Store(url)
     report = CompactionReport()
     ledger = Ledger(store)
     own, _ = ledger.counted()
     names = {*ledger.imported(), *own}
-    rows = [row for row in ledger.rows() if row["import"] in names]  # without one that ends meanwhile
+    rows = [row for row in ledger.rows() if row["import"] in names]  # without an import that ends after this
     report.files = sweep(store, ledger, rows)
     files = Files(store)
     runs = list(_runs(files, rows, before))

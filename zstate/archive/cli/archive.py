@@ -213,7 +213,7 @@ def compact_command(url: str, *, before: str | None) -> None:
     """Merge the files of each stream, robot and date, and what is listed of each recording.
 
     Lookups and queries answer as before, and need less time: each file costs all of them. Recordings may be
-    added and read meanwhile; run it once a day, for the days that are over. If it is interrupted, run it
+    added and read while it runs; run it once a day, for the days that are over. If it is interrupted, run it
     again. Files of recordings that overlap in time are not merged.
 
     \b
