@@ -190,15 +190,17 @@ def white_density(numbers: Floats, period_s: float) -> float:
     """The density of white noise of ``numbers`` (n, k), ``period_s`` apart, in the noisiest column.
 
     ``tau`` times the Allan variance at ``tau``, the mean square of differences of neighbours by two, is
-    constant for white noise, and is its squared density.
+    constant for white noise, and is its squared density. All means of a size are used, also those that
+    overlap: a few seconds hold few others (NIST SP 1065, 5.2.4).
     """
-    return math.sqrt(
-        max(
-            float((size * period_s * 0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0)).max())
-            for size in (1, 4, 16)
-            if len(means := _means(numbers, size)) > 1
-        )
-    )
+    sums = np.cumsum(numbers - numbers[0], axis=0)
+    sums = np.vstack([np.zeros_like(sums[:1]), sums])
+
+    def density_squared(size: int) -> float:
+        means = (sums[size:] - sums[:-size]) / size
+        return float((size * period_s * 0.5 * np.mean((means[size:] - means[:-size]) ** 2, axis=0)).max())
+
+    return math.sqrt(max(density_squared(size) for size in (1, 4, 16) if 2 * size <= len(numbers)))
 
 
 def _means(numbers: Floats, size: int) -> Floats:
