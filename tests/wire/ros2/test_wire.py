@@ -232,7 +232,7 @@ PAYLOADS = st.one_of(
 KEYS = st.text(st.characters(exclude_characters="*$?#/"), min_size=1).map(lambda ns: key_of(JOINT_STATES, ns))
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=4 * settings().max_examples)
 @given(STREAMS, st.tuples(PAYLOADS, BESIDE, KEYS), st.sampled_from(["", "*"]), st.booleans())
 def test_any_payload_is_decoded_or_refused_with_a_reason(stream, given_, namespace: str, behind_bridge: bool):
     one = (Ros2DdsWire if behind_bridge else Ros2Wire)(Ros2Options(namespace=namespace))
