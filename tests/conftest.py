@@ -42,7 +42,7 @@ if ROOT not in sys.path:
 
 # An example may take any time: on a busy machine one takes seconds.
 settings.register_profile("zstate", deadline=None)
-# For --hypothesis-profile: properties that another run has searched, with other versions of Python or of libraries.
+# For --hypothesis-profile: properties that another run has searched, with other versions.
 settings.register_profile("versions", deadline=None, max_examples=15)
 settings.load_profile("zstate")
 
