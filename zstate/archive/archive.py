@@ -31,7 +31,7 @@ from zstate.archive.files import Files, Groups, Stamps
 from zstate.archive.layout import EDGES, JOINTS, PARTS, POSE, WRITERS, folder_of, value_of
 from zstate.archive.ledger import Entry, compacted_stem, newest_compaction
 from zstate.archive.scene import Scene, Track
-from zstate.archive.storage import Store, arrow, in_threads
+from zstate.archive.storage import Store, arrow, in_threads, numbers_of
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput, LookupFailed, MessageError
@@ -200,7 +200,7 @@ class Archive:
             empty = np.empty((0, len(coordinates)))
             return JointHistory(joints, coordinates, rates, np.empty(0, np.int64), empty)
         history = JointHistory(
-            *(joints, coordinates, rates, table.column("stamp").to_numpy()),
+            *(joints, coordinates, rates, numbers_of(table.column("stamp"))),
             _matrix(table, "position.", coordinates),
             _known(table, "velocity.", rates),
             _known(table, "effort.", rates),
@@ -404,11 +404,11 @@ class Archive:
             table = self._table(files, columns)
             if table is None:
                 continue
-            times = table.column("stamp").to_numpy()
+            times = numbers_of(table.column("stamp"))
             if track is None:
                 parent = table.column("parent")[-1].as_py()
-                table = table.filter(arrow().compute.equal(table.column("parent"), parent))
-                times = table.column("stamp").to_numpy()
+                table = table.filter(arrow("compute").compute.equal(table.column("parent"), parent))
+                times = numbers_of(table.column("stamp"))
                 feed.load_poses((parent, key), times, _matrix(table, "", POSE), _covariances(table))
                 continue
             coordinates = coordinate_names(track.model)
@@ -425,13 +425,13 @@ class Archive:
         if not tables:
             return None
         table = pa.concat_tables(tables, promote_options="default")
-        stamps = table.column("stamp").to_numpy()
+        stamps = numbers_of(table.column("stamp"))
         if (np.diff(stamps) > 0).all():
             return table
         parts = [part for one, table in zip(ordered, tables, strict=True) for part in _by_entry(one, table)]
         parts.sort(key=lambda part: part[0].order)
         table = pa.concat_tables([part for _, part in parts], promote_options="default")
-        stamps = table.column("stamp").to_numpy()
+        stamps = numbers_of(table.column("stamp"))
         order = np.argsort(stamps, kind="stable")
         is_last = np.append(np.diff(stamps[order]) > 0, True)
         return table.take(pa.array(order[is_last]))
@@ -439,7 +439,7 @@ class Archive:
 
 def _by_entry(groups: Groups, table: Any) -> Iterator[tuple[Entry, Any]]:
     """The rows of each import in the ``table`` of samples that was read of ``groups``."""
-    stamps = table.column("stamp").to_numpy()
+    stamps = numbers_of(table.column("stamp"))
     for entry in groups.piece.entries:
         first, last = stamps.searchsorted(entry.first), stamps.searchsorted(entry.last, "right")
         if first < last:
@@ -462,7 +462,7 @@ def _matrix(table: Any, prefix: str, names: Sequence[str]) -> NDArray[np.float64
     matrix = np.zeros((table.num_rows, len(names)))
     for number, name in enumerate(names):
         if prefix + name in table.column_names:
-            matrix[:, number] = table.column(prefix + name).to_numpy()
+            matrix[:, number] = numbers_of(table.column(prefix + name))
     return matrix
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zstate.archive.layout import SUFFIX, WRITERS, check_version, cuts_by_date, folder_of, value_of
 from zstate.archive.ledger import Entry, Ledger, newest_compaction
-from zstate.archive.storage import Store, arrow
+from zstate.archive.storage import Store, arrow, numbers_of
 
 Stamps = NDArray[np.int64]
 
@@ -169,11 +169,9 @@ class Files:
                 columns = [name for name in columns if name in known]
             is_large = groups.rows >= _ROWS_FOR_THREADS
             table = opened.read_row_groups(groups.numbers, columns=columns, use_threads=is_large)
-        compute, stamps = arrow().compute, table.column("stamp")
-        ends = compute.min_max(stamps).as_py()
-        if ends["min"] < piece.first or ends["max"] > piece.last:  # samples of other imports
-            after = compute.greater_equal(stamps, piece.first)
-            return table.filter(compute.and_(after, compute.less_equal(stamps, piece.last)))
+        stamps = numbers_of(table.column("stamp"))
+        if stamps.min() < piece.first or stamps.max() > piece.last:  # samples of other imports
+            return table.filter(arrow().array((stamps >= piece.first) & (stamps <= piece.last)))
         return table
 
 
