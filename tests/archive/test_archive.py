@@ -215,6 +215,21 @@ def test_only_row_groups_around_the_stamps_are_read(tmp_path: Path, monkeypatch)
     assert sum(read) <= 4 * 16  # of 600 rows
 
 
+@pytest.mark.parametrize("offset", [-S, -1, 0, 1, 7 * MS, 13 * MS])
+def test_few_stamps_give_the_poses_that_many_give(tmp_path: Path, offset: int):
+    tour(tmp_path / "run.mcap", MIDNIGHT - 500 * MS, MIDNIGHT + 500 * MS)
+    import_recording(str(tmp_path / "a"), tmp_path / "run.mcap")
+    archive = Archive(str(tmp_path / "a"))
+    few = np.arange(MIDNIGHT - 600 * MS, MIDNIGHT + 600 * MS, 200 * MS) + offset
+    many = np.union1d(few, np.arange(MIDNIGHT - 600 * MS, MIDNIGHT + 600 * MS, MS))
+    for target, source in PAIRS:
+        poses, valid = archive.lookup_many(target, source, few, robot="arm")
+        expected, known = archive.lookup_many(target, source, many, robot="arm")
+        rows = many.searchsorted(few)
+        assert np.array_equal(valid, known[rows])
+        assert np.array_equal(poses, expected[rows], equal_nan=True)
+
+
 def test_a_lookup_loads_no_module_that_takes_longer_than_it(tmp_path: Path):
     with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
         builder.describe("arm", at=MIDNIGHT)
