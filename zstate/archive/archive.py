@@ -419,6 +419,7 @@ class Archive:
             table = self._table(files, columns)
             if table is None:
                 continue
+            parent = ""
             if track is None:
                 parent = table.column("parent")[-1].as_py()
                 table = table.filter(arrow("compute").compute.equal(table.column("parent"), parent))
