@@ -133,6 +133,7 @@ OBSERVERS = {
     "net.clock_offset",
     "net.connection_monitor",
     "net.graph",
+    "net.router_losses",
     "net.status_monitor",
     "net.topic_statistics",
     "nodes.listener_diagnostics",

@@ -91,8 +91,8 @@ class StateReader(Closeable):
                 )
             self._other_tf = self._subscribe_to_samples(opening)
             # History is requested from each writer found: after subscribing, so that no sample falls between.
-            on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
-            opening.enter_context(WriterWatch(session, robots, on_writer, wire, on_cut_off))
+            on_writer, before_losses = self._observed(self._on_writer), self._diagnostics.before_losses
+            opening.enter_context(WriterWatch(session, robots, on_writer, wire, before_losses))
             for name in robots:
                 for announcement in announce_reader(session, wire, name, (*latched, *self.ingests.streams)):
                     opening.enter_context(announcement)
@@ -296,10 +296,6 @@ class StateReader(Closeable):
 
     def _count_foreign(self, key: str, error: InvalidInput) -> None:
         self._counters.count_refusal("foreign", f"{shortened(key)}: {error}")
-
-    def _on_cut_off(self, announced: Announcement) -> None:
-        self._diagnostics.on_cut_off(announced)
-        self._on_writer(announced, alive=False)
 
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if self._other_tf is not None:
