@@ -60,7 +60,8 @@ NEIGHBOURS = {
 
 # The modules of the buffer that other packages may import.
 BUFFER_MODULES = {
-    *("buffer", "edge_rules", "feed", "frame_tree", "joint_samples", "projection", "snapshot", "tracks")
+    *("buffer", "edge_rules", "feed", "frame_tree", "joint_samples", "projection", "snapshot"),
+    *("stored_samples", "tracks"),
 }
 
 HOMES = {

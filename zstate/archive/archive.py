@@ -33,6 +33,7 @@ from zstate.archive.ledger import Entry, compacted_stem, newest_compaction
 from zstate.archive.scene import Scene, Track
 from zstate.archive.storage import Store, arrow, in_threads
 from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.stored_samples import load_joints, load_poses
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput, LookupFailed, MessageError
 from zstate.model.joint_history import JointHistory
@@ -409,12 +410,12 @@ class Archive:
                 parent = table.column("parent")[-1].as_py()
                 table = table.filter(arrow().compute.equal(table.column("parent"), parent))
                 times = table.column("stamp").to_numpy()
-                feed.load_poses((parent, key), times, _matrix(table, "", POSE), _covariances(table))
+                load_poses(feed, (parent, key), times, _matrix(table, "", POSE), _covariances(table))
                 continue
             coordinates = coordinate_names(track.model)
             rates = tuple(coordinates[slot] for slot in velocity_columns_by_position(track.model))
             velocities = None if is_pruned else _known(table, "velocity.", rates)
-            feed.load_joints(track, times, _matrix(table, "position.", coordinates), velocities)
+            load_joints(feed, track, times, _matrix(table, "position.", coordinates), velocities)
         return filled.buffer
 
     def _table(self, groups: Sequence[Groups], columns: Sequence[str] | None) -> Any:
