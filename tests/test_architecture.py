@@ -165,7 +165,12 @@ ON_USE = {
     "nodes.measurement_publisher",
     "other_plugins",
 }
-WITHOUT_EXTENSION = {"buffer.reference_history", "model.reference_transforms", "net.reference_ring"}
+WITHOUT_EXTENSION = {
+    "_util.reference_fields",
+    "buffer.reference_history",
+    "model.reference_transforms",
+    "net.reference_ring",
+}
 
 EVERYDAY = """
 import time
