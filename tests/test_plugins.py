@@ -24,6 +24,7 @@ from zstate.streams import Stream
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import READER_TOKEN
 from zstate.wire.native import NativeWire
+from zstate.wire.protocol import GraphNode
 
 ROOT = Path(__file__).parents[1]
 WRITER = WriterId("reader", "host", 1, 2, 3)
@@ -278,7 +279,9 @@ def test_metrics_count_its_messages_and_writers(sessions: tuple[Session, Session
 @pytest.mark.usefixtures("battery_plugin")
 def test_a_reader_of_several_streams_announces_those_of_others_apart():
     """A program without the package ignores a token that names its stream."""
-    tokens = NativeWire().reader_tokens("panda", ("battery", "tf", "imu"), WRITER, "zid", lambda: 1)
+    tokens = NativeWire().reader_tokens(
+        GraphNode("panda", WRITER, "zid", 0), ("battery", "tf", "imu"), lambda: 1
+    )
     assert [READER_TOKEN.parse(token)[1] for token in tokens] == [("tf", "imu"), ("battery",)]
 
 

@@ -11,7 +11,7 @@ from helpers.robots import wait_for_reader
 from zstate import StaticPublisher, Transform, connect
 from zstate.wire.identity import WriterId
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.protocol import WriterNode
+from zstate.wire.protocol import GraphNode
 from zstate.wire.ros2.wire import Ros2Wire
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -94,7 +94,7 @@ def test_unmeasured_values_are_null_in_json(ros_router: str):
 
     def send(command: Command) -> None:
         with connect(mode="client", endpoints=ros_router) as session:
-            node = WriterNode("r", WriterId("driver", "", 0, 0, 1), session.zid, 0)
+            node = GraphNode("r", WriterId("driver", "", 0, 0, 1), session.zid, 0)
             encoder = Ros2Wire().stream_encoder(node, "joint_states", number=1)
             wait_for_reader(session, encoder.key)
             session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))

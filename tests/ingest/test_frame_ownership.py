@@ -352,6 +352,17 @@ def test_only_placers_may_place_roots_of_other_robots():
     assert network.edges == OWN | {("site/map", "r1/world")}
 
 
+def test_only_placers_may_place_a_robot_that_is_not_known_yet():
+    """A reader that joins knows some robots before others."""
+    network = Network(placers=["site"])
+    network.statics("r2", "thief", ("r2/map", "r1/world"))
+    assert network.refused == {"foreign frame": 1}
+    network.statics("site", "map", ("site/map", "r1/world"))
+    assert network.edges == {("site/map", "r1/world")}
+    network.statics("r2", "mast", ("map", "mast"))
+    assert network.edges == {("site/map", "r1/world"), ("r2/map", "r2/mast")}
+
+
 def test_static_writers_of_one_name_and_two_robots_are_separate():
     network = Network()
     network.statics("r1", "calib", ("fleet/map", "fleet/board"))

@@ -1,12 +1,13 @@
 import re
 import threading
+import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 import zenoh
-from helpers.processes import Child, until
+from helpers.processes import DEADLINE_S, Child, until
 from helpers.robots import wait_for_reader
 
 from zstate.errors import Closed, InvalidInput
@@ -239,6 +240,26 @@ def test_value_that_does_not_arrive_is_logged(
         assert not values.received
         assert "3 requests, the last of 0.3 s" in caplog.text
         del requests, announced
+
+
+def test_a_value_for_which_a_slow_link_needs_longer_than_the_first_request_waits_is_received(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    first_s = 0.1
+    monkeypatch.setattr("zstate.net.latched._TIMEOUTS_S", (first_s, DEADLINE_S))
+    with connect() as writer, connect() as reader:
+        token = f"{key('a')}/@adv/pub/{writer.zid}/7/_"
+        requests: zenoh.Queryable = writer.zenoh.declare_queryable(token, zenoh.handlers.FifoChannel(8))
+        announced = writer.zenoh.liveliness().declare_token(token)
+        values = Values(reader)
+        pending: list[zenoh.Query] = []
+        until(lambda: pending.extend(iter(requests.try_recv, None)) or len(pending) == 2)
+        came = time.monotonic()
+        until(lambda: time.monotonic() - came > 2.0 * first_s)
+        with pending[1] as second:
+            second.reply(key("a"), b"value")
+        until(lambda: values.values == {key("a"): b"value"})
+        del announced
 
 
 def test_large_values_reach_advanced_subscribers_of_zenoh_once_as_those_of_ros_nodes():

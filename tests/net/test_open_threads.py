@@ -44,10 +44,15 @@ def threads_of(pid: int) -> dict[str, int]:
     return {pool: sum(name.startswith(f"{pool}-") for name in names) for pool in ("net", "tx", "rx", "acc")}
 
 
-def opened(spawn, *arguments: str) -> tuple[dict[str, int], str | None]:
+def opened(spawn, *arguments: str, least: int = 0) -> tuple[dict[str, int], str | None]:
+    """The threads once there are ``least`` of net and rx, and the environment that opening leaves behind."""
     child: Child = spawn(OPENING, *arguments)
     left_behind = json.loads(child.line())
-    until(lambda: threads_of(child.process.pid)["tx"])  # it may only just be starting
+
+    def have_started(threads: dict[str, int]) -> bool:
+        return threads["tx"] > 0 and min(threads["net"], threads["rx"]) >= least
+
+    until(lambda: have_started(threads_of(child.process.pid)))
     threads = threads_of(child.process.pid)
     child.send_line()
     assert (child.wait(), child.stderr) == (0, "")
@@ -56,8 +61,8 @@ def opened(spawn, *arguments: str) -> tuple[dict[str, int], str | None]:
 
 def test_router_has_many_threads_and_the_environment_is_unchanged(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    threads, left_behind = opened(spawn, json.dumps({"mode": "router", "listen": endpoint}), endpoint)
-    assert min(threads["net"], threads["rx"]) >= 128
+    router = json.dumps({"mode": "router", "listen": endpoint})
+    _, left_behind = opened(spawn, router, endpoint, least=128)
     assert left_behind is None
 
 

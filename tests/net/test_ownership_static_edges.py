@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -15,7 +16,7 @@ from helpers.robots import RRBOT
 from helpers.tokens import current_tokens
 
 from zstate.errors import SecondWriter
-from zstate.net.presence import announce
+from zstate.net.presence import ANSWER_WITHIN_S, announce
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -94,19 +95,26 @@ def test_one_of_two_simultaneous_static_writers_of_a_frame_gets_second_writer(pa
 
 
 def test_one_of_two_simultaneous_writers_of_a_moving_edge_gets_second_writer(pair):
-    for _ in range(2):
+    rounds = 0
+    while rounds < 2 * ROUNDS:
         with (
             TransformPublisher(pair[0], "r1", "wheels", program="wheels") as wheels,
             TransformPublisher(pair[1], "r1", "visual", program="visual") as visual,
         ):
             for number in range(ROUNDS):  # of the first edge the writers watch no tokens yet
                 edges = [Transform("odom", f"base{number}", [1, 0, 0], [0, 0, 0, 1])]
-                place, error = only_error(
-                    run_together(partial(wheels.publish, edges), partial(visual.publish, edges))
-                )
+                publish = partial(wheels.publish, edges), partial(visual.publish, edges)
+                began = time.monotonic()
+                errors = run_together(*publish)
+                if time.monotonic() - began > ANSWER_WITHIN_S and not any(errors):
+                    # Replies of a busy machine that are later are not waited for: a later sample raises.
+                    until(lambda publish=publish: any(run_together(*publish)))
+                    break
+                place, error = only_error(errors)
                 assert error.first.program == ("visual", "wheels")[place]
                 assert error.edge == ("r1/odom", f"r1/base{number}")
-            assert wheels.stats.sent + visual.stats.sent == ROUNDS
+                rounds += 1
+                assert wheels.stats.sent + visual.stats.sent == number + 1
 
 
 # Peers do not wait for a reply that may never come: they miss each other once in a hundred times.

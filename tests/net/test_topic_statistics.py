@@ -6,6 +6,7 @@ from helpers.processes import until
 
 from zstate import connect, discover
 from zstate.clouds import CloudPublisher
+from zstate.net.sites import Thinning
 from zstate.net.topic_statistics import (
     Arrival,
     IntervalStatistics,
@@ -33,6 +34,17 @@ def test_burst_changes_the_arrival_rate_but_not_the_stamp_rate():
     assert window is not None
     assert window.rate_hz == pytest.approx(2 / 0.08)
     assert window.stamp_rate_hz == pytest.approx(50.0)
+
+
+def test_a_thinned_stream_that_comes_in_a_burst_is_still_thinned():
+    """A stalled link passes samples of 5 Hz on together; a busy one passes those of 50 Hz on slowly."""
+    thinning = Thinning("plant1", 5.0)
+    assert thinning.explains(
+        added((0, 0, 1, 0), (600, 200, 11, 400), (601, 400, 21, 201), (602, 600, 31, 2)).window()
+    )
+    assert not thinning.explains(added((0, 0, 1, 0), (200, 20, 2, 180), (400, 40, 4, 360)).window())
+    assert not thinning.explains(added((0, 0, 1, 0)).window())
+    assert not thinning.explains(None)
 
 
 def test_delays_are_from_stamp_to_arrival():

@@ -398,6 +398,7 @@ def test_an_active_sensor_is_not_replayed(sessions, scanned: Path):
     writer, reader = sessions
     geometry = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.0, "range_max": 1.0}
     with ScanPublisher(reader, "cart", "rear", **geometry):
+        until(lambda: current_tokens(writer, WRITER_TOKEN.expression("cart"), 1.0))
         with pytest.raises(SecondWriter, match="rear"):
             replay(writer, scanned)
         assert replay(writer, scanned, takeover=True) == 2 * COUNT

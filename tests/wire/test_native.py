@@ -58,7 +58,7 @@ from zstate.wire.native import (
     encoding_of,
     joint_positions,
 )
-from zstate.wire.protocol import SerializedSample, StreamEncoder, Wire, WriterNode
+from zstate.wire.protocol import GraphNode, SerializedSample, StreamEncoder, Wire
 
 WRITER = WriterId("arm", "jetson", 412, 5, 7)
 NAMES = ("j1", "j2")
@@ -554,7 +554,7 @@ def test_one_changed_byte_raises_only_message_error(message: Message, at: int, v
 
 
 def encoder_of(stream: StreamName, name: str = "") -> StreamEncoder:
-    return NativeWire().stream_encoder(WriterNode("r1", WRITER, "z1", 0), stream, number=0, name=name)
+    return NativeWire().stream_encoder(GraphNode("r1", WRITER, "z1", 0), stream, number=0, name=name)
 
 
 def test_native_wire_implements_the_protocol_for_every_stream():

@@ -7,6 +7,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import NoReturn
 
 CHECKED_AFTER_S = 0.5
@@ -68,3 +70,19 @@ def _is_on_its_way() -> bool:
     while error is not None and not isinstance(error, SignalExit):
         error = error.__context__
     return error is not None
+
+
+@contextmanager
+def deferred_signals() -> Generator[None]:
+    """A signal to end that arrives in the block is handled after it. For the main thread."""
+    arrived: list[int] = []
+    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        for number in handlers:
+            signal.signal(number, lambda number, _: arrived.append(number))
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in arrived:
+            signal.raise_signal(number)

@@ -34,7 +34,13 @@ from zstate.ingest.precedence import EdgePrecedence, Rank
 from zstate.model.robot import RobotModel
 from zstate.streams import StreamName
 from zstate.transform import Transform
-from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, foreign_edge_problem, frame_owner
+from zstate.wire.keys import (
+    FOREIGN_FRAME,
+    EdgeNames,
+    foreign_edge_problem,
+    frame_owner,
+    is_frame_of_another,
+)
 
 CONTESTED = ("second parent", "second writer", "loop")
 """The refusal reasons of edges that exclude each other."""
@@ -534,12 +540,12 @@ class FrameOwnership:
             self.feed.add_frames(claim.names)
 
     def _rank(self, claim: EdgeClaim) -> Rank:
-        robot, owner = claim.source.robot, frame_owner(claim.child)
+        robot, child = claim.source.robot, claim.child
         if not claim.order:
             return Rank.MODEL if claim.source.is_model else Rank.CALLER
-        if self._is_shared or owner == robot:
-            return Rank.MODEL if claim.source.is_model else Rank.OWN
-        return Rank.OTHERS if owner in self._robots else Rank.OWN
+        if not self._is_shared and is_frame_of_another(robot, child, self._robots, self._placers):
+            return Rank.OTHERS
+        return Rank.MODEL if claim.source.is_model else Rank.OWN
 
     def _precedence(self, claim: EdgeClaim) -> EdgePrecedence:
         is_departed = self._is_departed(claim)

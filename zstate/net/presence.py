@@ -25,7 +25,7 @@ from zstate.net.streams import Receiver, call_for_each
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MAX_NAME_LENGTH, shortened
-from zstate.wire.protocol import Wire, WriterTokens
+from zstate.wire.protocol import GraphNode, Wire, WriterTokens
 from zstate.wire.registry import get_wire
 
 CAPACITY = 16_384
@@ -71,7 +71,9 @@ def announce_reader(
 
     ``program`` is its name for others; default: the script's name.
     """
-    tokens = wire.reader_tokens(robot, streams, local_writer(0, program), session.zid, session.next_number)
+    reader = local_writer(0, program)
+    node = GraphNode(robot, reader, session.zid, session.node_number(robot, reader.program))
+    tokens = wire.reader_tokens(node, streams, session.next_number)
     return [announce(session, token) for token in tokens]
 
 

@@ -234,6 +234,8 @@ class Session(Closeable):
         """False once this session is closed, and in a forked process."""
         self._lock = fork_safe_lock()
         self._numbers = itertools.count()
+        self._nodes: dict[tuple[str, str], int] = {}
+        self._written_nodes: set[tuple[str, str]] = set()
         self._ended_queryables: set[str] = set()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
@@ -256,6 +258,21 @@ class Session(Closeable):
     def next_number(self) -> int:
         """The next of the numbers 0, 1, 2, ..., unique in this session."""
         return next(self._numbers)
+
+    def node_number(self, robot: str, program: str, *, is_writer: bool = False) -> int:
+        """The number of a node in a ROS graph: all readers of ``robot`` in ``program``, and its first writer.
+
+        Further writers are nodes of their own: what one node writes shows what it computes.
+        """
+        node = (robot, program)
+        with self._lock:
+            if is_writer and node in self._written_nodes:
+                return self.next_number()
+            if is_writer:
+                self._written_nodes.add(node)
+            if node not in self._nodes:
+                self._nodes[node] = self.next_number()
+            return self._nodes[node]
 
     # zenoh 1.10, a queryable stays in the routes while another session has an equal one: delete when fixed
     # (eclipse-zenoh/zenoh pull request 2660 mends that between routers, not for clients and peers)

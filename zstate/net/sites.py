@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote, unquote
 
 import zenoh
@@ -24,6 +24,9 @@ from zstate.net.streams import Receiver
 from zstate.stream_registry import find_stream
 from zstate.streams import StreamName
 from zstate.wire.keys import Chunk, Key, check_robot, shortened
+
+if TYPE_CHECKING:
+    from zstate.net.topic_statistics import Window
 
 _TOKEN_LENGTH = 4000
 """The length of the names in one token. Keys may be longer, but each router keeps them."""
@@ -83,8 +86,12 @@ class Thinning(NamedTuple):
     site: str
     rate_hz: float
 
-    def explains(self, rate_hz: float | None) -> bool:
-        """Whether the site makes the gaps in samples that arrive at ``rate_hz``: within it more arrive."""
+    def explains(self, window: Window | None) -> bool:
+        """Whether the site makes the gaps in these samples: within it more of them arrive.
+
+        By their stamps: a link that stalls passes them on in a burst.
+        """
+        rate_hz = None if window is None else window.stamped_hz
         return rate_hz is not None and rate_hz <= _MOST * self.rate_hz
 
     def __str__(self) -> str:

@@ -73,6 +73,11 @@ class Window:
         first, last = self.received[0], self.received[-1]
         return mean_rate_hz(last.seq - first.seq + 1, last.stamp - first.stamp)
 
+    @property
+    def stamped_hz(self) -> float | None:
+        """Of the samples that arrived, by their stamps: independent of bursts, but not of losses."""
+        return mean_rate_hz(len(self.received), self.received[-1].stamp - self.received[0].stamp)
+
     @cached_property
     def intervals_s(self) -> list[float]:
         """Between arrivals."""

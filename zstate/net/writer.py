@@ -18,7 +18,7 @@ from zstate.streams import StreamName
 from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import Message
-from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
+from zstate.wire.protocol import GraphNode, StreamEncoder, Wire
 
 if TYPE_CHECKING:
     from zstate._kernel import PublishPath
@@ -101,7 +101,8 @@ class WireWriter(Closeable):
         self._session = session
         self.wire = wire
         names = sample_names or SampleLayout()
-        self._node = WriterNode(robot, writer, session.zid, session.next_number(), names)
+        number = session.node_number(robot, writer.program, is_writer=True)
+        self._node = GraphNode(robot, writer, session.zid, number, names)
         self._is_permitted = wire.name == "ros2dds"  # the permissions of these are the bridges' own
         self._opened = ExitStack()
         self._waiting: list[str] | None = None

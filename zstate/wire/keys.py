@@ -303,17 +303,28 @@ FOREIGN_FRAME = "foreign frame"
 """The reason of an InsertRefused for an edge that places another robot's frame."""
 
 
+def is_frame_of_another(
+    robot: str, frame: str, robots: Collection[str], placers: Collection[str] | None = None
+) -> bool:
+    """Whether ``frame`` belongs to another robot than ``robot``: one of ``robots``, which are on the network.
+
+    With ``placers`` also to one that is not, or not yet.
+    """
+    owner = frame_owner(frame)
+    return owner != robot and (owner in robots or (placers is not None and owner != frame))
+
+
 def foreign_edge_problem(
     robot: str, edge: EdgeNames, robots: Collection[str], placers: Collection[str] | None = None
 ) -> str:
     """Why a writer of ``robot`` may not publish ``edge`` at all; empty if it may.
 
-    ``robots`` are the robots on the network. Only ``placers`` may place the root of another robot; None
-    permits all.
+    ``robots`` are the robots on the network. Only ``placers`` may place the root of another robot, also
+    before that is on the network; None permits all.
     """
     parent, child = edge
     owner, other = frame_owner(child), frame_owner(parent)
-    if owner == robot or owner not in robots:
+    if not is_frame_of_another(robot, child, robots, placers):
         return ""
     whose = f"{child!r} is a frame of robot {owner!r}, and the edge from {parent!r} came from robot {robot!r}"
     if placers is not None and robot not in placers:

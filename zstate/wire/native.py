@@ -19,7 +19,7 @@ from zstate.streams import BULK_BYTES, StreamName
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import JointState, Message, check_edges, check_size
-from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
+from zstate.wire.protocol import Envelope, GraphNode, SerializedSample
 
 VERSION = 1
 
@@ -148,22 +148,22 @@ class NativeWire:
     def carries(self, stream: StreamName) -> bool:
         return find_stream(stream) is not None
 
-    def node_token(self, node: WriterNode) -> None:
+    def node_token(self, node: GraphNode) -> None:
         return None
 
     def stream_encoder(
-        self, node: WriterNode, stream: StreamName, number: int, name: str = ""
+        self, node: GraphNode, stream: StreamName, number: int, name: str = ""
     ) -> NativeStreamEncoder:
-        return NativeStreamEncoder(node.robot, node.writer, stream, name)
+        return NativeStreamEncoder(node.robot, node.identity, stream, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
+        self, node: GraphNode, streams: Sequence[StreamName], number: Callable[[], int]
     ) -> tuple[str, ...]:
-        identity = replace(reader, session=number()).identity
+        identity = replace(node.identity, session=number()).identity
         # A program that does not know a stream ignores all of its token.
         own = [stream for stream in streams if is_own(stream)]
         others = [[stream] for stream in streams if not is_own(stream)]
-        return tuple(keys.READER_TOKEN.key(robot, one, identity) for one in (own, *others) if one)
+        return tuple(keys.READER_TOKEN.key(node.robot, one, identity) for one in (own, *others) if one)
 
     def expression(self, robot: str, stream: StreamName, name: str = keys.ANY) -> str:
         return keys.stream_expression(robot, stream, name)

@@ -43,14 +43,14 @@ class Envelope(NamedTuple):
 NO_ENVELOPE = Envelope("")
 
 
-class WriterNode(NamedTuple):
-    """``writer`` of ``robot`` on the network: its Zenoh session, and its number within that session.
+class GraphNode(NamedTuple):
+    """A writer or reader of ``robot``, a node in a ROS graph: its Zenoh session, and its number in that.
 
-    ``sample_names`` are the names behind the numbers of its samples.
+    ``sample_names`` are the names behind the numbers of a writer's samples.
     """
 
     robot: str
-    writer: WriterId
+    identity: WriterId
     zid: str
     number: int
     sample_names: SampleLayout = SampleLayout()
@@ -136,12 +136,12 @@ class Wire(WriterTokens, Protocol):
         """Whether the wire format has this stream."""
         ...
 
-    def node_token(self, node: WriterNode) -> str | None:
+    def node_token(self, node: GraphNode) -> str | None:
         """The liveliness token of a writer as a node of the ROS graph; None if there is no such graph."""
         ...
 
     def stream_encoder(
-        self, node: WriterNode, stream: StreamName, number: int, name: str = ""
+        self, node: GraphNode, stream: StreamName, number: int, name: str = ""
     ) -> StreamEncoder:
         """The encoder of ``stream`` for the writer ``node``.
 
@@ -151,9 +151,9 @@ class Wire(WriterTokens, Protocol):
         ...
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
+        self, node: GraphNode, streams: Sequence[StreamName], number: Callable[[], int]
     ) -> tuple[str, ...]:
-        """The liveliness tokens of ``reader`` for ``streams`` of ``robot``, or of all robots for ``"*"``.
+        """The liveliness tokens of ``node``, a reader of ``streams``, of all robots if its robot is ``"*"``.
 
         ``number()`` returns the next unused number of the session.
         """

@@ -671,8 +671,9 @@ def test_robots_with_a_map_each_are_advised_to_share_one():
         static_edges(("a", "map", "world"), ("b", "map", "world")),
     ):
         report = diagnosed(code=0)
-    (found,) = [check for check in report["checks"] if check["state"] == "warning"]
-    assert (found["name"], found["robot"]) == ("frames", None)
+    # A busy machine may also be warned of: that a robot is slower than commanded.
+    (found,) = [check for check in report["checks"] if check["name"] == "frames" and check["robot"] is None]
+    assert found["state"] == "warning"
     assert found["text"] == (
         "'a/map' and 'b/map' are different frames; name one that robots share in full, such as fleet/map"
     )

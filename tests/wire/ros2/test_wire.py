@@ -24,7 +24,7 @@ from zstate.driving.ros2 import Ros2Controller
 from zstate.errors import InvalidInput, MessageError
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.protocol import SerializedSample, StreamEncoder, WriterNode
+from zstate.wire.protocol import GraphNode, SerializedSample, StreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import LASER_SCAN, OCCUPANCY_GRID
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
@@ -34,7 +34,7 @@ GOOD = rosbags_joint_state(STAMP, "", ("a",), [1.0], [], [])
 GID = bytes(range(16))
 ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 WRITER = WriterId("arm driver", "host", 4, 5, 6)
-NODE = WriterNode("r1", WRITER, ZID, 3)
+NODE = GraphNode("r1", WRITER, ZID, 3)
 DDS_TOPICS = {
     "joint_states": "sensor_msgs§msg§JointState",
     "tf": "tf2_msgs§msg§TFMessage",

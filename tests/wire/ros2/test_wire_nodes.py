@@ -27,6 +27,7 @@ from zstate.model.kinematics import MovingEdges
 from zstate.model.robot import RobotModel
 from zstate.net.discovery import discover
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
@@ -142,6 +143,16 @@ def test_the_graph_has_one_node_with_four_publishers_as_ros_would_announce_them(
     ids = [node[3], *(chunks[4] for chunks in alive.values())]
     assert len(set(ids)) == 5
     assert all(re.fullmatch(r"\d+", one) for one in ids)
+    until(lambda: tokens(reader) == [])
+
+
+def test_a_program_that_reads_and_writes_is_one_node_until_it_does_neither(sessions):
+    program, reader = sessions
+    with StatePublisher(program, RRBOT, "ros", ("ros2",), streams=["tf"]):
+        with TransformListener(program, "ros", wire="ros2"):
+            until(lambda: {one.split("/")[5] for one in tokens(reader)} == {"NN", "MP", "MS"})
+            assert len([one for one in tokens(reader) if "/NN/" in one]) == 1
+        until(lambda: sorted(one.split("/")[5] for one in tokens(reader)) == ["MP", "NN"])
     until(lambda: tokens(reader) == [])
 
 

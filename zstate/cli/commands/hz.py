@@ -16,6 +16,7 @@ from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.stream_reader import StreamReader, TimedSample
+    from zstate.net.topic_statistics import Window
     from zstate.streams import StreamName
 
 _SETTLING_S = 0.1
@@ -92,8 +93,10 @@ def hz_command(
         while time.monotonic() < end:
             count, facts = _read_for(1.0, reader, statistics), statistics.facts()
             if facts is not None and (count or once):
-                is_thinned = facts["missed"] and thinning is not None and thinning.explains(facts["rate_hz"])
-                by_site = thinning if is_thinned else None
+                has_gaps, newest = facts["missed"] > 0, statistics.window()
+                by_site = (
+                    thinning if has_gaps and thinning is not None and thinning.explains(newest) else None
+                )
                 if as_json:
                     print_json({**facts, "thinned_by": None if by_site is None else by_site.site})
                 else:
@@ -135,9 +138,13 @@ class MessageStatistics:
                 statistics.clear()
             statistics.add(Arrival(received.arrival, sample.stamp, sample.seq, 0), sample.session)
 
+    def window(self) -> Window | None:
+        """The last messages; None before the first."""
+        return self._statistics.window()
+
     def facts(self) -> dict[str, Any] | None:
         """The printed figures; None before two messages. ``missed`` counts since the start."""
-        window = self._statistics.window()
+        window = self.window()
         if window is None or window.rate_hz is None:
             return None
         return {

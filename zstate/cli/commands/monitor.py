@@ -414,12 +414,13 @@ class RobotMonitor(Closeable):
                 facts["driver"] = None if driver is None else _driver_facts(driver)
                 print_json({**facts, "faults": list(map(_fault_facts, faulty))})
                 continue
-            rate = _rate_text(one.buffer.statistics_of(one.robot), measure.rate_hz)
+            statistics = one.buffer.statistics_of(one.robot)
+            rate = _rate_text(statistics, measure.rate_hz)
             for stream, rate_hz in rates.items():
                 rate += f"  {stream} {rate_text(rate_hz) if rate_hz else 'silent'}"
             reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
             thinning = self._sites.thinning(one.robot, one.follow)
-            is_thinned = thinning is not None and thinning.explains(measure.rate_hz)
+            is_thinned = thinning is not None and thinning.explains(statistics.window())
             gaps = "held back on purpose" if is_thinned else "missed"
             print_wrapped(
                 f"{one.robot}  {rate}  "

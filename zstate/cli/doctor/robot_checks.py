@@ -17,6 +17,7 @@ from zstate.model.representative_links import representative_links
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
+from zstate.net.topic_statistics import Window
 from zstate.nodes.publisher_status import ARE_OUTSIDE
 from zstate.stream_registry import is_named
 from zstate.streams import JOINT_STREAMS, StreamName
@@ -190,10 +191,10 @@ def _samples_check(probe: RobotProbe) -> Check:
         return refused
     if window.rate_hz is None:
         return warning(stream, f"one sample from {writer}; too few for a rate", f"zstate hz {robot}")
-    return _rate_check(probe, writer, window.rate_hz)
+    return _rate_check(probe, writer, window, window.rate_hz)
 
 
-def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
+def _rate_check(probe: RobotProbe, writer: str, window: Window, rate_hz: float) -> Check:
     stream, robot, statistics = probe.followed, probe.info.name, probe.samples.statistics
     silence, hz = format_duration(round(statistics.silent_s() * 1e9)), f"zstate hz {robot} --stream {stream}"
     if statistics.is_stale():
@@ -204,7 +205,7 @@ def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
         return ok(stream, f"{text}, newest {silence} ago")
     lost, arrived = stats.missed + stats.dropped, statistics.count
     thinning = probe.sites.thinning(robot, stream) if lost else None  # none is lost at the site itself
-    if thinning is not None and thinning.explains(rate_hz) and rate_hz >= _MIN_RECEIVED * thinning.rate_hz:
+    if thinning is not None and thinning.explains(window) and rate_hz >= _MIN_RECEIVED * thinning.rate_hz:
         return ok(stream, f"{text}, {thinning}, newest {silence} ago")
     if status is not None and rate_hz < _MIN_RECEIVED * status.rate_hz:
         text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost or downsampled on the way"

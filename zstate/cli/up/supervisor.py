@@ -9,6 +9,7 @@ from typing import Literal
 
 from zstate.cli.output.console import print_status
 from zstate.cli.processes import END_WITHIN_S, ChildProcess
+from zstate.cli.signals import deferred_signals
 from zstate.cli.up.processes import ProcessSpec
 from zstate.clock import LONGEST_WAIT_S
 
@@ -62,7 +63,8 @@ class Supervisor:
                 for process in self._processes.values():
                     is_due = process.child is None and not process.is_over and time.monotonic() >= process.due
                     if is_due and not self._not_ready(process):
-                        process.child, process.started = self._start(process), time.monotonic()
+                        with deferred_signals():  # one in between would leave a process that nobody knows
+                            process.child, process.started = self._start(process), time.monotonic()
                         process.is_ready = process.is_ready or process.spec.ready is None
                 failure = self._next_event()
                 if time.monotonic() > report_at:

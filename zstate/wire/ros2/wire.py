@@ -14,7 +14,7 @@ from zstate.streams import StreamName
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
 from zstate.wire.messages import Message, check_edges, check_size
-from zstate.wire.protocol import Envelope, SerializedSample, WriterNode
+from zstate.wire.protocol import Envelope, GraphNode, SerializedSample
 from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.graph import (
@@ -66,35 +66,34 @@ class Ros2Wire:
     def carries(self, stream: StreamName) -> bool:
         return stream in ros_streams()
 
-    def node_token(self, node: WriterNode) -> str | None:
+    def node_token(self, node: GraphNode) -> str | None:
         self._frame_names(node.robot)  # raises InvalidInput before anything is declared
         return self._node(node).key
 
     def stream_encoder(
-        self, node: WriterNode, stream: StreamName, number: int, name: str = ""
+        self, node: GraphNode, stream: StreamName, number: int, name: str = ""
     ) -> RosStreamEncoder:
         token = self._endpoint_token(node, stream, "MP", number, name)
         names, key = self._frame_names(node.robot), self._keys.key(node.robot, stream, name)
         return RosStreamEncoder(names, node.sample_names, key, token, gid(token) if self._has_gids else None)
 
-    def _node(self, node: WriterNode) -> NodeToken:
+    def _node(self, node: GraphNode) -> NodeToken:
         namespace = f"/{self.options.robot_namespace(node.robot)}"
-        name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", node.writer.program, flags=re.ASCII)
+        name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", node.identity.program, flags=re.ASCII)
         return NodeToken(self.options.domain, node.zid, node.number, "/", namespace, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[StreamName], reader: WriterId, zid: str, number: Callable[[], int]
+        self, node: GraphNode, streams: Sequence[StreamName], number: Callable[[], int]
     ) -> tuple[str, ...]:
-        if robot == ANY:
+        if node.robot == ANY:
             if self.options.namespace == ANY:
                 return ()  # a subscription in the graph has one topic; these are any number of topics
-            robot = SHARED
-        node = WriterNode(robot, reader, zid, number())
+            node = node._replace(robot=SHARED)
         endpoints = [self._endpoint_token(node, stream, "MS", number()) for stream in streams]
         return tuple(token for token in (self.node_token(node), *endpoints) if token is not None)
 
     def _endpoint_token(
-        self, node: WriterNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
+        self, node: GraphNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
         """The token of ``node`` as publisher ("MP") or subscriber ("MS") of ``stream``."""
         topic, dds_type = self._keys.topic(node.robot, stream, name), ros_type(stream).dds
@@ -178,12 +177,12 @@ class Ros2DdsWire(Ros2Wire):
         super().__init__(options)
         self._received: Counter[str] = Counter()
 
-    def node_token(self, node: WriterNode) -> None:
+    def node_token(self, node: GraphNode) -> None:
         """None, because the bridges announce no nodes. Raises InvalidInput as above."""
         super().node_token(node)
 
     def _endpoint_token(
-        self, node: WriterNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
+        self, node: GraphNode, stream: StreamName, kind: Literal["MP", "MS"], number: int, name: str = ""
     ) -> str:
         ros, topic = ros_type(stream), self._keys.key(node.robot, stream, name)
         return DdsToken(node.zid, kind, topic, ros.name, ros_stream(stream).qos, ros.hash).key
