@@ -2,23 +2,29 @@
 
 A recording of ``robot`` at 1 kHz, joint states without transforms, is imported. Then a synthetic archive is
 made of ``robots`` for ``days``, ``seconds`` a day at ``rate`` samples a second, an import for each robot and
-day. Poses of the last link in the first are looked up at ``poses`` stamps between the samples, evenly over
-all robots and days; then it is compacted. Files may be in the page cache; the first of the times is with
-nothing read by this process.
+day. Poses of the last link in the first are looked up between the samples of all robots and days: two in each
+file, which is what a file costs; then ``poses`` in all of them, and of the first robot. Then it is compacted,
+and measured again. Files are in the page cache. CPU is that of the process with all of its threads; the first
+of the times is with nothing read by this process.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bench.micro.form import Row
+from bench.micro.form import Row, mean_times_us
 from zstate import Archive, load_model
 from zstate.archive import compact, import_recording
 from zstate.archive.importer import SampleTable, listed
@@ -67,12 +73,34 @@ def measure(
         make_archive(
             url, model, robots=robots, days=days, samples=round(seconds * rate), period_ns=round(S / rate)
         )
-        size = sum(path.stat().st_size for path in Path(url).rglob("*") if path.is_file())
-        yield Row("synthetic archive", "MB", [size / 1e6])
-        yield from lookup_rows(url, model, robots=robots, days=days, span_ns=round(seconds * S), poses=poses)
-        yield from sql_rows(url)
-        yield Row("compaction", "s", [seconds_of(lambda: compact(url))])
-        yield from sql_rows(url)
+        frames = model.links[0], model.links[1], model.links[-1]
+        asked = Asked(url, *frames, robots, days, round(seconds * S))
+        yield from archive_rows(asked, poses)
+        yield Row("compaction", "s of CPU", [cpu_s_of(lambda: compact(url))])
+        yield from archive_rows(asked, poses)
+
+
+class Asked(NamedTuple):
+    """What is looked up in an archive: ``source`` in ``target``, to which ``next_link`` has one joint."""
+
+    url: str
+    target: str
+    next_link: str
+    source: str
+    robots: int
+    days: int
+    span_ns: int
+
+    def stamps(self, each: int) -> NDArray[np.int64]:
+        """So many stamps of each day."""
+        offsets = np.linspace(1, self.span_ns - self.span_ns // 100, each).astype(np.int64)
+        return (START + np.arange(self.days)[:, None] * DAY + offsets).ravel()
+
+    def look_up(self, archive: Archive, stamps: NDArray[np.int64], robots: int) -> None:
+        """Look up the poses of the first ``robots``. All must be known."""
+        for number in range(robots):
+            _, valid = archive.lookup_many(self.target, self.source, stamps, robot=f"r{number}")
+            assert valid.all()
 
 
 def import_rows(root: Path, model: RobotModel, seconds: float) -> Iterator[Row]:
@@ -148,46 +176,94 @@ def make_archive(
                     staged.replace(Path(url, path))  # without the synchronisation of an import
 
 
-def lookup_rows(
-    url: str, model: RobotModel, *, robots: int, days: int, span_ns: int, poses: int
-) -> Iterator[Row]:
-    """Rows of lookups over all days, and at one instant."""
-    each = max(2, poses // (robots * days))
-    offsets = np.linspace(1, span_ns - span_ns // 100, each).astype(np.int64)
-    stamps = (START + np.arange(days)[:, None] * DAY + offsets).ravel()
-    target, source = model.links[0], model.links[-1]
+def archive_rows(asked: Asked, poses: int) -> Iterator[Row]:
+    """Rows of an archive as it is."""
+    paths = [path for path in Path(asked.url).rglob("*") if path.is_file()]
+    yield Row("synthetic archive", "files", [len(paths)])
+    yield Row("its size", "MB", [sum(path.stat().st_size for path in paths) / 1e6])
+    yield from lookup_rows(asked, poses)
+    yield from instant_rows(asked)
+    yield from sql_rows(asked)
 
-    def look_up(archive: Archive) -> None:
-        for number in range(robots):
-            _, valid = archive.lookup_many(target, source, stamps, robot=f"r{number}")
-            assert valid.all()
 
-    archive = Archive(url)
-    count = robots * len(stamps)
-    yield Row(f"{count} poses, the first time", "s", [seconds_of(lambda: look_up(archive))])
-    before = time.process_time()
-    yield Row("the same again", "s", [seconds_of(lambda: look_up(archive))])
-    yield Row("poses a second of CPU", "M/s", [count / (time.process_time() - before) * 1e-6])
+def lookup_rows(asked: Asked, poses: int) -> Iterator[Row]:
+    """Rows of lookups over all days."""
+    archive, files = Archive(asked.url), asked.robots * asked.days
+    few, many = asked.stamps(2), asked.stamps(max(2, poses // files))
+    for when in ("the first time", "again"):
+        spent_s = cpu_s_of(lambda: asked.look_up(archive, few, asked.robots))
+        yield Row(f"two poses in each of {files} files, {when}", "ms a file", [1e3 * spent_s / files])
+    spent_s = cpu_s_of(lambda: asked.look_up(archive, many, asked.robots))
+    yield Row(f"{len(many) * asked.robots} poses in all of them", "s of CPU", [spent_s])
+    alone = asked.stamps(max(2, poses // asked.days))
+    before, begin = time.process_time(), time.perf_counter()
+    asked.look_up(archive, alone, 1)
+    spent_s, took_s = time.process_time() - before, time.perf_counter() - begin
+    yield Row(f"{len(alone)} poses of one robot, in {asked.days} files", "s of CPU", [spent_s])
+    yield Row("the same by the clock", "s", [took_s])
+    yield Row("the same", "M poses/s of CPU", [len(alone) / spent_s * 1e-6])
+    buffer = archive.buffer("r0", START, START + asked.span_ns)
+    stamps = np.linspace(START, START + asked.span_ns * 99 // 100, 1 << 15).astype(np.int64)
+    calls = {
+        source: partial(buffer.lookup_many, asked.target, source, stamps)
+        for source in (asked.next_link, asked.source)
+    }
+    for source, times in mean_times_us(calls, 5, 3).items():
+        yield Row(f"{source} in a buffer in memory", "ns a pose", [1e3 * us / len(stamps) for us in times])
 
-    def one_instant() -> None:
-        instant = int(stamps[len(stamps) // 2])
-        assert Archive(url).lookup_many(target, source, [instant], robot="r0")[1].all()
 
-    yield Row(
-        "one instant, the archive opened for it", "ms", [1e3 * seconds_of(one_instant) for _ in range(20)]
+def instant_rows(asked: Asked) -> Iterator[Row]:
+    """Rows of lookups at one instant of the middle of the time, the archive opened for each."""
+    (instant,) = asked.stamps(1)[[asked.days // 2]].tolist()
+
+    def look_up() -> None:
+        asked.look_up(Archive(asked.url), np.array([instant]), 1)
+
+    look_up()
+    yield Row("one instant", "ms", [1e3 * seconds_of(look_up) for _ in range(20)])
+    yield Row("the same", "ms of CPU", [1e3 * cpu_s_of(look_up) for _ in range(20)])
+    times = np.array([new_process(asked, instant) for _ in range(5)])
+    for number, what in enumerate(("Python and numpy", "pyarrow", "zstate, and the lookup")):
+        yield Row(f"the same in a new process: {what}", "ms of CPU", times[:, number].tolist())
+
+
+def new_process(asked: Asked, instant: int) -> list[float]:
+    """The CPU time of a new process that looks up a pose, by its parts [ms]."""
+    code = (
+        "import json, sys, time, numpy; times = [time.process_time()]\n"
+        "import pyarrow.fs, pyarrow.parquet; times.append(time.process_time())\n"
+        "from zstate import Archive; url, *frames, instant = json.load(sys.stdin)\n"
+        "assert Archive(url).lookup_many(*frames, [instant], robot='r0')[1].all()\n"
+        "print(json.dumps([*times, time.process_time()]))"
     )
+    question = json.dumps([asked.url, asked.target, asked.source, instant])
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, input=question, text=True, stdout=subprocess.PIPE, check=True)
+    return (np.diff(json.loads(done.stdout), prepend=0.0) * 1e3).tolist()
 
 
-def sql_rows(url: str) -> Iterator[Row]:
-    """Rows of counts by robot and day."""
-    yield Row("DuckDB: connection with its views", "ms", [1e3 * seconds_of(Archive(url).duckdb)])
-    with Archive(url).duckdb() as connection:
+def sql_rows(asked: Asked) -> Iterator[Row]:
+    """Rows of a connection, and of queries."""
+    yield Row("DuckDB: connection with its views", "s of CPU", [cpu_s_of(Archive(asked.url).duckdb)])
+    day = np.datetime64(START + asked.days // 2 * DAY, "ns").astype("datetime64[D]")
+    with Archive(asked.url).duckdb() as connection:
         for what, query in (
-            ("files", "SELECT robot, date, sum(rows) FROM files GROUP BY ALL"),
-            ("joint_states", "SELECT robot, date, count(*) FROM joint_states GROUP BY ALL"),
+            ("count by robot and day, from files", "SELECT robot, date, sum(rows) FROM files GROUP BY ALL"),
+            ("the same, of the samples", "SELECT robot, date, count(*) FROM joint_states GROUP BY ALL"),
+            (
+                "mean of one robot and day",
+                f"SELECT avg(stamp) FROM joint_states WHERE robot = 'r0' AND date = '{day}'",
+            ),
         ):
-            times = [1e3 * seconds_of(connection.sql(query).fetchall) for _ in range(5)]
-            yield Row(f"DuckDB: count by robot and day, of {what}", "ms", times)
+            times = [cpu_s_of(connection.sql(query).fetchall) for _ in range(3)]
+            yield Row(f"DuckDB: {what}", "s of CPU", times)
+
+
+def cpu_s_of(call: Callable[[], object]) -> float:
+    """The CPU time of a call, of all threads [s]."""
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
 
 
 def seconds_of(call: Callable[[], object]) -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -211,6 +213,39 @@ def test_only_row_groups_around_the_stamps_are_read(tmp_path: Path, monkeypatch)
     _, valid = archive.lookup_many("base", "tool", [MIDNIGHT - 3 * S + 1, MIDNIGHT + 3 * S + 1], robot="arm")
     assert valid.all()
     assert sum(read) <= 4 * 16  # of 600 rows
+
+
+@pytest.mark.parametrize("offset", [-S, -1, 0, 1, 7 * MS, 13 * MS])
+def test_few_stamps_give_the_poses_that_many_give(tmp_path: Path, offset: int):
+    tour(tmp_path / "run.mcap", MIDNIGHT - 500 * MS, MIDNIGHT + 500 * MS)
+    import_recording(str(tmp_path / "a"), tmp_path / "run.mcap")
+    archive = Archive(str(tmp_path / "a"))
+    few = np.arange(MIDNIGHT - 600 * MS, MIDNIGHT + 600 * MS, 200 * MS) + offset
+    many = np.union1d(few, np.arange(MIDNIGHT - 600 * MS, MIDNIGHT + 600 * MS, MS))
+    for target, source in PAIRS:
+        poses, valid = archive.lookup_many(target, source, few, robot="arm")
+        expected, known = archive.lookup_many(target, source, many, robot="arm")
+        rows = many.searchsorted(few)
+        assert np.array_equal(valid, known[rows])
+        assert np.array_equal(poses, expected[rows], equal_nan=True)
+
+
+def test_a_lookup_loads_no_module_that_takes_longer_than_it(tmp_path: Path):
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
+        builder.describe("arm", at=MIDNIGHT)
+        for stamp in range(MIDNIGHT, MIDNIGHT + S, 20 * MS):
+            builder.joints("arm", stamp, swing_positions(stamp / S))
+    import_recording(str(tmp_path / "a"), tmp_path / "run.mcap")
+    code = (
+        "import sys, zstate; url, stamp = sys.argv[1:]\n"
+        "assert zstate.Archive(url).lookup_many('world', 'tool', [int(stamp)], robot='arm')[1].all()\n"
+        "print(*{name.partition('.')[0] for name in sys.modules})\n"
+        "print(*(name for name in sys.modules if name.startswith('pyarrow.')))"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "a"), str(MIDNIGHT + 10 * MS)]
+    loaded = set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert "pyarrow.parquet" in loaded
+    assert not loaded & {"pandas", "mcap", "duckdb", "pyarrow.dataset", "pyarrow.compute"}
 
 
 def test_a_moved_camera_and_another_model_count_from_their_own_recording_on(tmp_path: Path):

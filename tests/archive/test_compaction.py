@@ -64,7 +64,8 @@ def sample_files(url: str) -> list[Path]:
     return sorted(Path(url).glob("stream=*/*/*/*.parquet"))
 
 
-def test_a_compacted_archive_has_one_file_for_each_date_and_the_same_answers(tmp_path: Path):
+def test_a_compacted_archive_has_one_file_for_each_date_and_the_same_answers(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("zstate.archive.ledger._ROWS_PER_GROUP", 2)  # of 15 files, some of an import in two
     url = split_tour(tmp_path)
     expected = answers(url)
     opened = Archive(url)
@@ -75,7 +76,10 @@ def test_a_compacted_archive_has_one_file_for_each_date_and_the_same_answers(tmp
     # joint states and two edges, on two dates; writers; the ledger
     assert (before, len(sample_files(url)), report.written) == (15, 6, 8)
     assert not list((tmp_path / "a" / "imports").glob("*")) if (tmp_path / "a" / "imports").exists() else True
+    (ledger,) = (tmp_path / "a" / "compacted").iterdir()
+    assert pq.read_metadata(ledger).num_row_groups == 8
     assert answers(url) == expected
+    assert import_recording(url, tmp_path / "1.mcap").is_known
     assert opened.lookup_many("map", "tip", STAMPS, robot="arm")[0].tobytes() == expected[2]
     assert list(check(url)) == []
     again = compact(url)

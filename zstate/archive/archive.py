@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.archive.files import Files, Groups, Stamps
+from zstate.archive.files import Files, Group, Groups, Stamps, by_file, needed_groups
 from zstate.archive.layout import EDGES, JOINTS, PARTS, POSE, WRITERS, folder_of, value_of
 from zstate.archive.ledger import Entry, compacted_stem, newest_compaction
 from zstate.archive.scene import Scene, Track
-from zstate.archive.storage import Store, arrow, in_threads
+from zstate.archive.storage import Store, arrow, in_threads, numbers_of
 from zstate.buffer.buffer import TransformBuffer, feed_of
 from zstate.buffer.stored_samples import load_joints, load_poses
 from zstate.clock import check_stamp, check_stamps
@@ -53,8 +53,15 @@ _MAX_ROWS = 300_000
 _STAMPS = 1 << 15
 """Stamps looked up at once, whose poses stay in the processor's cache."""
 
+_FEW = 4
+"""Only samples next to the stamps are copied if there are so many samples for each stamp."""
+
 Needed: TypeAlias = Mapping[Track, set[str]]
 """The tracks that lookups read, and of joints the coordinates."""
+
+Rows: TypeAlias = slice | NDArray[np.intp]
+
+_ALL: Rows = slice(None)
 
 _LOOKED_UP = (JOINTS, PARTS, EDGES)
 
@@ -84,7 +91,7 @@ class _Segment(NamedTuple):
     """The files of consecutive recordings of a robot with the same frames."""
 
     scene: Scene
-    entries: Sequence[Entry]
+    entries: list[Entry]
 
     @property
     def first(self) -> int:
@@ -108,7 +115,7 @@ class _Part(NamedTuple):
     """The ``rows`` of instants, and the row groups around these."""
 
     rows: slice
-    groups: Mapping[Track, Sequence[Groups]]
+    groups: Mapping[Track, Sequence[Group]]
 
 
 class Archive:
@@ -201,7 +208,7 @@ class Archive:
             empty = np.empty((0, len(coordinates)))
             return JointHistory(joints, coordinates, rates, np.empty(0, np.int64), empty)
         history = JointHistory(
-            *(joints, coordinates, rates, table.column("stamp").to_numpy()),
+            *(joints, coordinates, rates, numbers_of(table.column("stamp"))),
             _matrix(table, "position.", coordinates),
             _known(table, "velocity.", rates),
             _known(table, "effort.", rates),
@@ -251,7 +258,7 @@ class Archive:
             chosen = {track: tracks.get(track, []) for track in needed}
 
             def look_up(part: _Part, segment: _Segment = segment, needed: Needed = needed) -> None:
-                filled = self._filled(segment, part.groups, needed)
+                filled = self._filled(segment, part.groups, needed, instants[part.rows])
                 for start in range(part.rows.start, part.rows.stop, _STAMPS):
                     rows = slice(start, min(start + _STAMPS, part.rows.stop))
                     found, is_found = filled.lookup_many(target, source, instants[rows])
@@ -293,7 +300,7 @@ class Archive:
         entries = [one for one in self._files.records(robot, [name]) if one.stream == stream]
         columns = ("stamp", "log_time", "number", "name", "encoding", "message")
         groups = self._files.groups(entries, stamps, between=True)
-        tables = [self._files.read(one, columns) for one in groups]
+        tables = [self._files.read(one, columns) for one in by_file(groups)]
         return arrow().concat_tables(tables).sort_by("number") if tables else None
 
     def duckdb(self) -> DuckDBPyConnection:
@@ -334,7 +341,7 @@ class Archive:
                 if (robot, last) not in self._scenes:
                     self._scenes[robot, last] = Scene.read(self._files, robot, last)
                 segments.append(_Segment(self._scenes[robot, last], []))
-            segments[-1] = segments[-1]._replace(entries=[*segments[-1].entries, entry])
+            segments[-1].entries.append(entry)
         return segments
 
     def _only_segment(self, robot: str, stamps: Stamps) -> _Segment:
@@ -371,28 +378,36 @@ class Archive:
     def _parts(self, chosen: Mapping[Track, Sequence[Entry]], instants: Stamps) -> list[_Part]:
         """Consecutive ``instants`` with the row groups around them, as many at once as fit into memory."""
         found: list[_Part] = []
-        waiting = [slice(0, len(instants))]
+        whole = {
+            track: self._files.groups(entries, instants, between=False) for track, entries in chosen.items()
+        }
+        waiting = [_Part(slice(0, len(instants)), whole)]
         while waiting:
             part = waiting.pop()
-            stamps = instants[part]
-            groups = {
-                track: self._files.groups(entries, stamps, between=False) for track, entries in chosen.items()
-            }
-            rows = max((sum(one.rows for one in files) for files in groups.values()), default=0)
-            if rows > _MAX_ROWS and len(stamps) > 1:
-                middle = (part.start + part.stop) // 2
-                waiting += [slice(middle, part.stop), slice(part.start, middle)]
-            else:
-                found.append(_Part(part, groups))
+            start, stop = part.rows.start, part.rows.stop
+            rows = max((sum(one.rows for one in groups) for groups in part.groups.values()), default=0)
+            if rows <= _MAX_ROWS or stop - start == 1:
+                found.append(part)
+                continue
+            middle = (start + stop) // 2
+            for half in (slice(middle, stop), slice(start, middle)):
+                around = {
+                    track: needed_groups(groups, instants[half]) for track, groups in part.groups.items()
+                }
+                waiting.append(_Part(half, around))
         return found
 
     def _filled(
         self,
         segment: _Segment,
-        groups: Mapping[Track, Sequence[Groups]],
+        groups: Mapping[Track, Sequence[Group]],
         needed: Needed | None,
+        instants: Stamps | None = None,
     ) -> TransformBuffer:
-        """A buffer with the samples of ``groups``; of joints only the positions ``needed``, if given."""
+        """A buffer with the samples of ``groups``; of joints only the positions ``needed``, if given.
+
+        Samples that are not next to one of ``instants``, if these are given, may be left out.
+        """
         filled = segment.scene.buffer(())
         feed = feed_of(filled.buffer)
         for (stream, key), files in groups.items():
@@ -405,34 +420,39 @@ class Archive:
             table = self._table(files, columns)
             if table is None:
                 continue
-            times = table.column("stamp").to_numpy()
+            parent = ""
             if track is None:
                 parent = table.column("parent")[-1].as_py()
-                table = table.filter(arrow().compute.equal(table.column("parent"), parent))
-                times = table.column("stamp").to_numpy()
-                load_poses(feed, (parent, key), times, _matrix(table, "", POSE), _covariances(table))
+                table = table.filter(arrow("compute").compute.equal(table.column("parent"), parent))
+            times = numbers_of(table.column("stamp"))
+            rows = _ALL if instants is None else _rows_around(times, instants)
+            if track is None:
+                covariances = _covariances(table)
+                triangles = None if covariances is None else covariances[rows]
+                load_poses(feed, (parent, key), times[rows], _matrix(table, "", POSE, rows), triangles)
                 continue
             coordinates = coordinate_names(track.model)
             rates = tuple(coordinates[slot] for slot in velocity_columns_by_position(track.model))
-            velocities = None if is_pruned else _known(table, "velocity.", rates)
-            load_joints(feed, track, times, _matrix(table, "position.", coordinates), velocities)
+            velocities = None if is_pruned else _known(table, "velocity.", rates, rows)
+            positions = _matrix(table, "position.", coordinates, rows)
+            load_joints(feed, track, times[rows], positions, velocities)
         return filled.buffer
 
-    def _table(self, groups: Sequence[Groups], columns: Sequence[str] | None) -> Any:
+    def _table(self, groups: Sequence[Group], columns: Sequence[str] | None) -> Any:
         """The rows of ``groups`` by ascending stamps, each stamp once; None without any."""
         pa = arrow()
-        ordered = sorted(groups, key=lambda one: one.piece.entries[0].order)
+        ordered = sorted(by_file(groups), key=lambda one: one.piece.entries[0].order)
         tables = self._files.read_all(ordered, columns)
         if not tables:
             return None
         table = pa.concat_tables(tables, promote_options="default")
-        stamps = table.column("stamp").to_numpy()
+        stamps = numbers_of(table.column("stamp"))
         if (np.diff(stamps) > 0).all():
             return table
         parts = [part for one, table in zip(ordered, tables, strict=True) for part in _by_entry(one, table)]
         parts.sort(key=lambda part: part[0].order)
         table = pa.concat_tables([part for _, part in parts], promote_options="default")
-        stamps = table.column("stamp").to_numpy()
+        stamps = numbers_of(table.column("stamp"))
         order = np.argsort(stamps, kind="stable")
         is_last = np.append(np.diff(stamps[order]) > 0, True)
         return table.take(pa.array(order[is_last]))
@@ -440,7 +460,7 @@ class Archive:
 
 def _by_entry(groups: Groups, table: Any) -> Iterator[tuple[Entry, Any]]:
     """The rows of each import in the ``table`` of samples that was read of ``groups``."""
-    stamps = table.column("stamp").to_numpy()
+    stamps = numbers_of(table.column("stamp"))
     for entry in groups.piece.entries:
         first, last = stamps.searchsorted(entry.first), stamps.searchsorted(entry.last, "right")
         if first < last:
@@ -458,20 +478,31 @@ def _named(names: Sequence[str], prefix: str) -> list[str]:
     return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
 
 
-def _matrix(table: Any, prefix: str, names: Sequence[str]) -> NDArray[np.float64]:
+def _rows_around(times: Stamps, instants: Stamps) -> Rows:
+    """The samples next to ascending ``instants``, by their ascending ``times``; all if that is quicker."""
+    if len(instants) * _FEW > len(times):
+        return _ALL
+    after = times.searchsorted(instants)
+    is_next = np.zeros(len(times), np.bool_)
+    is_next[np.minimum(after, len(times) - 1)] = True
+    is_next[np.maximum(after - 1, 0)] = True
+    return np.flatnonzero(is_next)
+
+
+def _matrix(table: Any, prefix: str, names: Sequence[str], rows: Rows = _ALL) -> NDArray[np.float64]:
     """The columns ``prefix`` + ``names``, row by row; 0 for those not read, NaN for unknown numbers."""
-    matrix = np.zeros((table.num_rows, len(names)))
+    matrix = np.zeros((len(numbers_of(table.column("stamp"))[rows]), len(names)))
     for number, name in enumerate(names):
         if prefix + name in table.column_names:
-            matrix[:, number] = table.column(prefix + name).to_numpy()
+            matrix[:, number] = numbers_of(table.column(prefix + name))[rows]
     return matrix
 
 
-def _known(table: Any, prefix: str, names: Sequence[str]) -> NDArray[np.float64] | None:
+def _known(table: Any, prefix: str, names: Sequence[str], rows: Rows = _ALL) -> NDArray[np.float64] | None:
     """The same; None without any such column, or number."""
     if not _named(table.column_names, prefix):
         return None
-    matrix = _matrix(table, prefix, names)
+    matrix = _matrix(table, prefix, names, rows)
     return None if np.isnan(matrix).all() else matrix
 
 

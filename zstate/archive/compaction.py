@@ -188,11 +188,10 @@ def _merge(files: Files, run: list[Row], stem: str, staged: Path) -> None:
 def _copy(files: Files, path: str, entries: list[Entry], table: TableFile) -> None:
     ends = np.array([entries[0].first, entries[-1].last], np.int64)
     rows = 0
-    for groups in files.groups(entries, ends, between=True):
-        for number in groups.numbers:
-            part = files.read(Groups(groups.piece, [number], 0))
-            rows += part.num_rows
-            table.write(part)
+    for group in files.groups(entries, ends, between=True):
+        part = files.read(Groups(group.piece, [group.number], group.rows))
+        rows += part.num_rows
+        table.write(part)
     if rows != sum(one.rows for one in entries):
         where = files.store.where(path)
         raise RecordingError(f"{where!r} has {rows} rows in place of those that are listed", path=where)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zstate.archive.layout import SUFFIX, WRITERS, check_version, cuts_by_date, folder_of, value_of
 from zstate.archive.ledger import Entry, Ledger, newest_compaction
-from zstate.archive.storage import Store, arrow
+from zstate.archive.storage import Store, arrow, numbers_of
 
 Stamps = NDArray[np.int64]
 
@@ -36,6 +36,16 @@ class Piece(NamedTuple):
     def last(self) -> int:
         """The last stamp [ns]."""
         return max(one.last for one in self.entries)
+
+
+class Group(NamedTuple):
+    """The row group ``number`` of the file of a ``piece``, with stamps from ``first`` to ``last`` [ns]."""
+
+    piece: Piece
+    number: int
+    first: int
+    last: int
+    rows: int
 
 
 class Groups(NamedTuple):
@@ -101,7 +111,7 @@ class Files:
                 names.add(name)
         return self.records(robot, sorted(names))
 
-    def groups(self, entries: Sequence[Entry], stamps: Stamps, *, between: bool) -> list[Groups]:
+    def groups(self, entries: Sequence[Entry], stamps: Stamps, *, between: bool) -> list[Group]:
         """The row groups of files of one key with the samples around each of ascending ``stamps``.
 
         With ``between`` also all samples from the first to the last of the stamps.
@@ -112,13 +122,12 @@ class Files:
         pieces = [Piece(path, ordered) for path, ordered in by_path.items()]
         chosen = _needed([(one.first, one.last) for one in pieces], stamps, between=between)
         pieces = [pieces[number] for number in chosen]
-        spans: list[tuple[int, int]] = []
-        places: list[tuple[int, int, int]] = []
+        found: list[Group] = []
         self.store.in_threads(self.footer, [one.path for one in pieces if not self._has_one_group(one)])
-        for number, piece in enumerate(pieces):
+        for piece in pieces:
             if self._has_one_group(piece):
-                spans.append((piece.first, piece.last))
-                places.append((number, 0, sum(one.rows for one in piece.entries)))
+                rows = sum(one.rows for one in piece.entries)
+                found.append(Group(piece, 0, piece.first, piece.last, rows))
                 continue
             footer = self.footer(piece.path)
             column = footer.schema.names.index("stamp")
@@ -127,14 +136,8 @@ class Files:
                 statistics = about.column(column).statistics
                 first, last = max(statistics.min, piece.first), min(statistics.max, piece.last)
                 if first <= last:
-                    spans.append((first, last))
-                    places.append((number, group, about.num_rows))
-        found: dict[int, Groups] = {}
-        for one in _needed(spans, stamps, between=between):
-            number, group, rows = places[one]
-            before = found.get(number, Groups(pieces[number], [], 0))
-            found[number] = Groups(before.piece, [*before.numbers, group], before.rows + rows)
-        return list(found.values())
+                    found.append(Group(piece, group, first, last, about.num_rows))
+        return needed_groups(found, stamps, between=between)
 
     def _has_one_group(self, piece: Piece) -> bool:
         return piece.entries[0].groups == 1 and piece.path not in self._footers
@@ -164,17 +167,30 @@ class Files:
             )
             if path not in self._footers:
                 check_version(opened.metadata.metadata, self.store.where(path))
-            if columns is not None:
-                known = opened.schema_arrow.names
-                columns = [name for name in columns if name in known]
             is_large = groups.rows >= _ROWS_FOR_THREADS
             table = opened.read_row_groups(groups.numbers, columns=columns, use_threads=is_large)
-        compute, stamps = arrow().compute, table.column("stamp")
-        ends = compute.min_max(stamps).as_py()
-        if ends["min"] < piece.first or ends["max"] > piece.last:  # samples of other imports
-            after = compute.greater_equal(stamps, piece.first)
-            return table.filter(compute.and_(after, compute.less_equal(stamps, piece.last)))
+        stamps = numbers_of(table.column("stamp"))
+        if stamps.min() < piece.first or stamps.max() > piece.last:  # samples of other imports
+            return table.filter(arrow().array((stamps >= piece.first) & (stamps <= piece.last)))
         return table
+
+
+def needed_groups(groups: Sequence[Group], stamps: Stamps, *, between: bool = False) -> list[Group]:
+    """Those of ``groups`` with the samples around each of ascending ``stamps``; see ``Files.groups``.
+
+    Of the groups for some stamps, those for a part of these are the same as of all groups.
+    """
+    spans = [(one.first, one.last) for one in groups]
+    return [groups[number] for number in _needed(spans, stamps, between=between)]
+
+
+def by_file(groups: Iterable[Group]) -> list[Groups]:
+    """``groups``, together if they are in the same file."""
+    found: dict[str, Groups] = {}
+    for one in groups:
+        before = found.get(one.piece.path, Groups(one.piece, [], 0))
+        found[one.piece.path] = Groups(one.piece, [*before.numbers, one.number], before.rows + one.rows)
+    return list(found.values())
 
 
 def _needed(spans: Sequence[tuple[int, int]], stamps: Stamps, *, between: bool) -> list[int]:

@@ -45,7 +45,7 @@ from zstate.archive.layout import (
 )
 from zstate.archive.ledger import Ledger, record_path
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
-from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer, feed_of
 from zstate.buffer.joint_samples import track_samples
 from zstate.buffer.stored_samples import take_before
 from zstate.buffer.tracks import JointTrack, PoseTrack
@@ -66,7 +66,7 @@ from zstate.recording.joint_parts import has_parts
 from zstate.recording.joint_states import DELAYED_NS, JointStateBatch, RecordedJointReader
 from zstate.recording.mcap.file import split_files
 from zstate.recording.reader import RecordingReader
-from zstate.recording.recording import HISTORY_S, RecordingLoader
+from zstate.recording.recording import RecordingLoader
 from zstate.recording.stream_export import plain_columns
 from zstate.stream_registry import stream_named
 from zstate.streams import JOINT_STREAMS, StreamName
@@ -338,7 +338,7 @@ class _RobotImport:
             joints = RecordedJointReader(decoded, robot, refusals.count)
             if joints.model is None or not has_parts(beginning, robot, joints.model):
                 self._joints = joints
-        self._buffer = TransformBuffer(HISTORY_S)
+        self._buffer = TransformBuffer(RECORDING_HISTORY_S)
         self._loader = RecordingLoader.of(beginning, self._buffer, Counters(), (robot,))
         self._joined = JoinedMessages(decoded)
         self._decoded = decoded

@@ -66,6 +66,10 @@ _GROUP_VALUES = 1_000_000
 
 _GROUP_BYTES = 32_000_000
 _GROUPS_PER_FILE = 64
+
+_TINY_BYTES = 4096
+"""Of a table whose columns are read sooner than they are decompressed, and are no smaller compressed."""
+
 _DAY_NS = 86_400 * 10**9
 _FEW = 4
 """A column with one distinct number for each so many rows is encoded with a dictionary."""
@@ -279,4 +283,5 @@ def write_small(
     """Write a table that fits into memory, with so many rows in a row group."""
     pa = arrow()
     table = pa.Table.from_pylist(list(rows), schema=schema)
-    pa.parquet.write_table(table, path, per_group, compression="zstd", write_page_checksum=True)
+    compression = "zstd" if table.nbytes > _TINY_BYTES else "none"
+    pa.parquet.write_table(table, path, per_group, compression=compression, write_page_checksum=True)

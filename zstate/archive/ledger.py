@@ -12,7 +12,8 @@ import that was made later than the one in there counts in its place.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,9 +112,10 @@ class Ledger:
     def imported(self) -> Mapping[str, int]:
         """When each of the imports was made that the compaction lists."""
         if self._imported is None:
-            table = self._compacted_table(columns=["import", "imported"])
-            columns = ([],) * 2 if table is None else (column.to_pylist() for column in table.columns)
-            self._imported = dict(zip(*columns, strict=True))
+            self._imported = {}
+            if self.number:
+                table = self.table(compacted_path(self.number), ["import", "imported"])
+                self._imported = dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
         return self._imported
 
     def recorded_names(self) -> list[str]:
@@ -140,16 +142,14 @@ class Ledger:
     def files_of(self, name: str) -> list[Entry]:
         """The files that the import ``name`` has added, of all robots."""
         own = self.record(name)
-        table = self._compacted_table(filters=[("import", "=", name)])
-        listed = [] if table is None else entries_of(table.to_pylist())
+        listed = self._listed("import", name)
         return [*own] if _is_newer(own, listed) else listed
 
     def compacted(self, robot: str) -> Mapping[str, tuple[Entry, ...]]:
         """By import, the files of ``robot`` that the compaction lists."""
         if robot not in self._compacted:
-            table = self._compacted_table(filters=[("robot", "=", robot)])
             found: dict[str, list[Entry]] = {}
-            for one in [] if table is None else entries_of(table.drop_columns(["columns"]).to_pylist()):
+            for one in self._listed("robot", robot):
                 found.setdefault(one.name, []).append(one)
             self._compacted[robot] = {name: tuple(entries) for name, entries in found.items()}
         return self._compacted[robot]
@@ -228,18 +228,35 @@ class Ledger:
                 found.append(path)
         return found
 
-    def table(self, path: str, **options: Any) -> Any:
+    def table(self, path: str, columns: Sequence[str] | None = None) -> Any:
         """A table that fits into memory, a pyarrow.Table. Raises RecordingError."""
+        with self._opened(path) as file:
+            return file.read(columns, use_threads=False)
+
+    @contextmanager
+    def _opened(self, path: str) -> Generator[Any, None, None]:
         with self._store.opened(path) as file:
             opened = arrow().parquet.ParquetFile(file, page_checksum_verification=True)
             check_version(opened.metadata.metadata, self._store.where(path))
-            if not options:
-                return opened.read(use_threads=False)
-            file.seek(0)
-            return arrow().parquet.read_table(file, use_threads=False, partitioning=None, **options)
+            yield opened
 
-    def _compacted_table(self, **options: Any) -> Any:
-        return self.table(compacted_path(self.number), **options) if self.number else None
+    def _listed(self, column: str, value: str) -> list[Entry]:
+        """The entries of the compaction with ``value``; only row groups that may have it are read."""
+        if not self.number:
+            return []
+        rows: list[Mapping[str, Any]] = []
+        columns = [name for name in record_schema().names if name != "columns"]
+        with self._opened(compacted_path(self.number)) as file:
+            place = file.metadata.schema.names.index(column)
+            for group in range(file.num_row_groups):
+                about = file.metadata.row_group(group).column(place).statistics
+                if about.min <= value <= about.max:
+                    table = file.read_row_group(group, columns, use_threads=False)
+                    found = [n for n, one in enumerate(table.column(column).to_pylist()) if one == value]
+                    if found:  # rows of one robot are together
+                        part = table.slice(found[0], found[-1] + 1 - found[0])
+                        rows += (row for row in part.to_pylist() if row[column] == value)
+        return entries_of(rows)
 
 
 def _is_newer(own: Sequence[Entry], compacted: Sequence[Entry]) -> bool:

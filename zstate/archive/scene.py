@@ -13,12 +13,11 @@ import numpy as np
 
 from zstate.archive.files import Files
 from zstate.archive.layout import EDGES, FRAMES, JOINTS, MODELS, PARTS, POSE, SUFFIX, folder_of
-from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer, feed_of
 from zstate.buffer.stored_samples import load_poses
 from zstate.buffer.tracks import JointTrack
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.model.urdf import parse_urdf
-from zstate.recording.recording import HISTORY_S
 from zstate.transform import Transform
 
 Track = tuple[str, str]
@@ -66,7 +65,7 @@ class Scene:
 
     def buffer(self, edges: Iterable[tuple[str, str]]) -> SceneBuffer:
         """A buffer of the frames, and of the moving ``edges``, which have a placeholder each."""
-        buffer = TransformBuffer(HISTORY_S)
+        buffer = TransformBuffer(RECORDING_HISTORY_S)
         feed = feed_of(buffer)
         feed.set_recording()
         feed.name_robot(self.robot)

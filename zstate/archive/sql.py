@@ -168,7 +168,7 @@ def _add_view(
             texts = ", ".join(_quoted(one, "'") for one in full)
             sources.append(f"read_parquet([{texts}], {hive})")
             continue
-        pa = arrow()
+        pa = arrow("dataset")
         keys = pa.schema([(key, pa.date32() if key == "date" else pa.string()) for key in folders])
         dataset = pa.dataset.dataset(
             full,

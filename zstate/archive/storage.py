@@ -22,6 +22,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from zstate.errors import LibraryMissing
 from zstate.recording.errors import RecordingError
 
@@ -39,18 +42,32 @@ R = TypeVar("R")
 
 
 @cache
-def arrow() -> Any:
-    """The module pyarrow, with the parts that archives use. Raises LibraryMissing."""
+def arrow(*parts: str) -> Any:
+    """The module pyarrow, with its parts fs and parquet, and these. Raises LibraryMissing.
+
+    Those take long to load: dataset loads pandas, and compute takes as long as pyarrow itself.
+    """
     try:
         import pyarrow  # noqa: PLC0415 - an extra
 
-        for part in ("compute", "dataset", "fs", "parquet"):
+        for part in ("fs", "parquet", *parts):
             import_module(f"pyarrow.{part}")
     except ImportError as error:
         raise LibraryMissing(
             f"an archive needs pyarrow, which cannot be loaded ({error}): pip install 'zstate[archive]'"
         ) from None
     return pyarrow
+
+
+def numbers_of(column: Any) -> NDArray[Any]:
+    """The numbers of a column, a pyarrow.ChunkedArray, NaN where there is none.
+
+    They are read in place if they are in one piece. pyarrow's own conversion loads pandas, if it is there.
+    """
+    if column.null_count or not column.num_chunks:
+        return column.to_numpy()
+    parts = [np.from_dlpack(chunk) for chunk in column.chunks]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 class StoredFile(NamedTuple):

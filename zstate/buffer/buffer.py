@@ -55,6 +55,9 @@ S = TypeVar("S")
 DEFAULT_HISTORY_S = 10.0
 """What buffers and listeners keep by default; as in tf2."""
 
+RECORDING_HISTORY_S = 9e8
+"""What buffers of a whole recording keep: 28 years, on any clock."""
+
 # The number of choices of robots whose snapshot readers are cached.
 _MAX_CACHED_READERS = 16
 

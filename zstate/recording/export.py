@@ -34,12 +34,12 @@ from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer, feed_of
 from zstate.errors import InvalidInput, LibraryMissing, LookupFailed
 from zstate.model.joint_history import JointHistory
 from zstate.recording.errors import RecordingError
 from zstate.recording.joint_states import DELAYED_NS, JointStateBatch
-from zstate.recording.recording import HISTORY_S, Recording
+from zstate.recording.recording import Recording
 from zstate.wire.keys import frame_owner
 from zstate.wire.messages import Sample
 
@@ -297,7 +297,7 @@ class StreamedBuffer:
         self._robot = robot
         self._poses = poses
         self._stamps = stamps
-        self._buffer = TransformBuffer(HISTORY_S)
+        self._buffer = TransformBuffer(RECORDING_HISTORY_S)
         self._messages = recording.fill(self._buffer)
         self._newest = -(1 << 63)
         self._returned: int | None = None

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer, feed_of
 from zstate.checks import Points, check_points
 from zstate.clock import check_stamps, check_stamps_of_points
 from zstate.errors import InvalidInput
@@ -83,8 +83,6 @@ if TYPE_CHECKING:
     from zstate.scans.messages import LaserScan, OccupancyGrid
     from zstate.scans.scan import Scan
 
-# A buffer that keeps a whole recording: 28 years, on any clock.
-HISTORY_S = 9e8
 # The buffer drops unneeded samples after every so many messages, at least.
 _BATCH = 4096
 _UNNAMED = "a ROS node"
@@ -148,7 +146,7 @@ class Recording(Closeable):
 
     def _buffer_of_joints(self, robot: str, refuse: Callable[[str, str], None]) -> TransformBuffer:
         """A buffer with the model and all joint states of ``robot`` alone."""
-        buffer, counters = TransformBuffer(HISTORY_S), Counters()
+        buffer, counters = TransformBuffer(RECORDING_HISTORY_S), Counters()
         for _ in self._fill(buffer, counters, (robot,), (*JOINT_STREAMS, "robot_description")):
             pass
         texts = counters.refusals()
@@ -164,7 +162,7 @@ class Recording(Closeable):
         grows with their number, not with the recording. Reads the recording once from beginning to end.
         """
         stamps = None if around is None else np.unique(check_stamps(around))
-        buffer = TransformBuffer(HISTORY_S)
+        buffer = TransformBuffer(RECORDING_HISTORY_S)
         batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
         for count, _ in enumerate(self.fill(buffer), 1):
             if stamps is not None and not count % batch:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from zstate._util.closeable import Closeable
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer
 from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.buffer.tracks import TimeSpan, Track
 from zstate.clock import Clock
@@ -19,7 +19,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
 from zstate.recording.decode import STREAMS
-from zstate.recording.recording import HISTORY_S, Recording
+from zstate.recording.recording import Recording
 from zstate.view.recorded_world import RecordedWorld
 from zstate.view.world_source import DECODED_STREAMS, WorldData, WorldSource
 from zstate.wire.keys import ANY
@@ -66,7 +66,7 @@ class ViewSource(Closeable):
     @classmethod
     def from_recording(cls, path: str | Path) -> ViewSource:
         """The robots, scans and maps of a recording, an MCAP file or a bag. Raises RecordingError."""
-        buffer = TransformBuffer(HISTORY_S)
+        buffer = TransformBuffer(RECORDING_HISTORY_S)
         with Recording(path) as recording, ExitStack() as opening:
             world = opening.enter_context(RecordedWorld(path))
             for decoded in recording.fill(buffer, (*STREAMS, *DECODED_STREAMS)):

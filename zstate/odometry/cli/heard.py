@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer
 from zstate.checks import Floats
 from zstate.model.joint_history import JointHistory
 from zstate.model.robot import RobotModel, coordinate_names
@@ -112,9 +112,9 @@ def heard_in(path: str, robot: str, seconds: float) -> Heard:
 
     Raises RecordingError.
     """
-    from zstate.recording.recording import HISTORY_S, Recording
+    from zstate.recording.recording import Recording
 
-    heard = Heard(robot, path, seconds, TransformBuffer(HISTORY_S))
+    heard = Heard(robot, path, seconds, TransformBuffer(RECORDING_HISTORY_S))
     with Recording(path, robot) as recording:
         for _, message, _ in recording.fill(heard.mounts):
             if isinstance(message, RobotDescription) and heard.model is None:

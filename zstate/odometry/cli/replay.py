@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer
 from zstate.checks import Floats
 from zstate.cli.output.text_layout import Table
 from zstate.errors import InvalidInput, LookupFailed, NoData, UnknownFrame
@@ -39,7 +39,7 @@ from zstate.odometry.messages import Fix, Odometry, Pose
 from zstate.odometry.planar import in_plane, map_in_plane
 from zstate.odometry.sensors import Estimators, add_imu
 from zstate.recording.cli.plot import new_figure
-from zstate.recording.recording import HISTORY_S, Recording
+from zstate.recording.recording import Recording
 from zstate.streams import StreamName
 from zstate.wire.keys import full_name
 from zstate.wire.messages import RobotDescription
@@ -134,7 +134,7 @@ def replay(
     Without a state, ``ReplayedOdometry.states`` is empty. Raises RecordingError, and InvalidInput for unknown
     mounts, for a sensor or reference without messages, and for one without noise.
     """
-    mounts, model = TransformBuffer(HISTORY_S), None
+    mounts, model = TransformBuffer(RECORDING_HISTORY_S), None
     if reference is not None and reference.stream == "pose" and reference.sensor in settings.pose:
         raise InvalidInput(f"{reference} is a source: it would judge itself; leave one of the two out")
     with Recording(path, robot) as recording:
