@@ -60,7 +60,8 @@ NEIGHBOURS = {
 
 # The modules of the buffer that other packages may import.
 BUFFER_MODULES = {
-    *("buffer", "edge_rules", "feed", "frame_tree", "joint_samples", "projection", "snapshot", "tracks")
+    *("buffer", "edge_rules", "feed", "frame_tree", "joint_samples", "projection", "snapshot"),
+    *("stored_samples", "tracks"),
 }
 
 HOMES = {
@@ -133,6 +134,7 @@ OBSERVERS = {
     "net.clock_offset",
     "net.connection_monitor",
     "net.graph",
+    "net.router_losses",
     "net.status_monitor",
     "net.topic_statistics",
     "nodes.listener_diagnostics",
@@ -163,7 +165,12 @@ ON_USE = {
     "nodes.measurement_publisher",
     "other_plugins",
 }
-WITHOUT_EXTENSION = {"buffer.reference_history", "model.reference_transforms", "net.reference_ring"}
+WITHOUT_EXTENSION = {
+    "_util.reference_fields",
+    "buffer.reference_history",
+    "model.reference_transforms",
+    "net.reference_ring",
+}
 
 EVERYDAY = """
 import time

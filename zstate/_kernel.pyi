@@ -1,17 +1,48 @@
 """The C extension, made of buffer/_kernel.c. ``zstate.extension.kernel`` is "c" if it is used."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 from numpy.typing import NDArray
 from typing_extensions import Buffer
 
-from zstate.transform import Transform
+from zstate.transform import Kind, MaybeNone, Transform
 
 REVISION: int
 
 StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 FailureTuple: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
+
+class TransformFields:
+    """The data of a Transform, set once."""
+
+    target: str
+    source: str
+    stamp: int | MaybeNone
+    kind: Kind
+    predicted_s: float
+    _pose: tuple[float, ...]
+
+    def _fill(
+        self,
+        target: str,
+        source: str,
+        pose: tuple[float, ...],
+        stamp: int | None,
+        kind: Kind,
+        predicted_s: float = 0.0,
+    ) -> None: ...
+    @classmethod
+    def trusted(
+        cls,
+        target: str,
+        source: str,
+        pose: tuple[float, ...],
+        stamp: int | None,
+        kind: Kind,
+        predicted_s: float = 0.0,
+    ) -> Self:
+        """From seven floats without a check: for the buffer, which checked them at insert."""
 
 def placement_poses(
     placements: NDArray[Any], rows: NDArray[Any], parents: NDArray[Any], poses: NDArray[Any], /

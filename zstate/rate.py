@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 from collections.abc import Iterator
@@ -10,8 +9,6 @@ from dataclasses import dataclass
 
 from zstate.clock import MONOTONIC, SYSTEM, Clock
 from zstate.errors import InvalidInput
-
-_LOG = logging.getLogger("zstate")
 
 
 @dataclass(frozen=True, slots=True)

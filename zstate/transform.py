@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -21,7 +21,6 @@ from zstate.extension import kernel
 
 Array: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["static", "exact", "interpolated", "predicted"]
-F = TypeVar("F", bound="TransformFields")
 MaybeNone: TypeAlias = Any
 """None if nothing between the frames moves, which no type checker can know of two names.
 
@@ -58,52 +57,10 @@ def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
     return (*values[:3], *(value / norm for value in values[3:]))
 
 
-if TYPE_CHECKING or kernel == "reference":
-
-    class TransformFields:
-        """The data of a Transform, set once; the C extension makes one in a tenth of the time."""
-
-        __slots__ = ("_pose", "kind", "predicted_s", "source", "stamp", "target")
-
-        target: str
-        source: str
-        stamp: int | MaybeNone
-        kind: Kind
-        predicted_s: float
-        _pose: tuple[float, ...]
-
-        def _fill(  # noqa: PLR0917 - one call for all fields, on the hot path
-            self,
-            target: str,
-            source: str,
-            pose: tuple[float, ...],
-            stamp: int | None,
-            kind: Kind,
-            predicted_s: float = 0.0,
-        ) -> None:
-            values = zip(
-                TransformFields.__slots__, (pose, kind, predicted_s, source, stamp, target), strict=True
-            )
-            for name, value in values:
-                object.__setattr__(self, name, value)
-
-        @classmethod
-        def trusted(  # noqa: PLR0917 - the buffer's hot path
-            cls: type[F],
-            target: str,
-            source: str,
-            pose: tuple[float, ...],
-            stamp: int | None,
-            kind: Kind,
-            predicted_s: float = 0.0,
-        ) -> F:
-            """From seven floats without a check: for the buffer, which checked them at insert."""
-            fields = cls.__new__(cls)
-            fields._fill(target, source, pose, stamp, kind, predicted_s)
-            return fields
-
-else:
+if TYPE_CHECKING or kernel == "c":
     from zstate._kernel import TransformFields
+else:
+    from zstate._util.reference_fields import TransformFields
 
 
 COVARIANCE_NUMBERS = 21

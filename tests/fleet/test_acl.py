@@ -27,6 +27,7 @@ from zstate.net.discovery import discover_readers
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.presence import announce
 from zstate.net.session import Session
+from zstate.net.sites import SITE_TOKEN
 from zstate.net.streams import KeyPublisher, StreamSubscriber
 from zstate.nodes.partial_publisher import PartialStatePublisher
 from zstate.nodes.publisher import STREAMS
@@ -425,7 +426,8 @@ def test_router_without_users_denies_everything(tmp_path):
 
 
 def test_rules_name_every_chunk_that_wildcards_skip():
-    forms = [one for one in vars(keys).values() if isinstance(one, keys.Key) and "/@" in one.form]
+    rows = (*vars(keys).values(), SITE_TOKEN)
+    forms = [one for one in rows if isinstance(one, keys.Key) and "/@" in one.form]
     requests = (keys.MOTION, keys.ODOMETRY_REQUEST)
     chunks = {"@adv", *(one.verbatim for one in forms if one not in requests)}
     assert len(chunks) >= 2

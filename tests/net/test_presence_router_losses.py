@@ -10,7 +10,8 @@ from helpers.processes import until
 
 from zstate.errors import Unreachable
 from zstate.net.discovery import discover
-from zstate.net.presence import RouterLossDetector, WriterWatch, announce
+from zstate.net.presence import WriterWatch, announce
+from zstate.net.router_losses import RouterLossDetector
 from zstate.net.session import connect
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import WRITER_TOKEN
@@ -34,21 +35,22 @@ def test_leaving_writer_is_distinguished_from_a_lost_router(spawn, free_port):
     with (
         connect(mode="client", endpoints=endpoint) as theirs,
         connect(mode="client", endpoints=endpoint) as ours,
+        RouterLossDetector(ours) as losses,
         WriterWatch(
             ours,
             "*",
             lambda _, alive: changes.append("there" if alive else "gone"),
-            on_cut_off=lambda _: changes.append("cut off"),
+            before_losses=lambda: changes.append("cut off" if losses.lost_recently() else "left"),
         ),
     ):
         with announce(theirs, TOKEN):
             until(lambda: changes == ["there"])
-        until(lambda: changes == ["there", "gone"])
+        until(lambda: changes == ["there", "left", "gone"])
         with announce(theirs, TOKEN):
-            until(lambda: changes == ["there", "gone", "there"])
+            until(lambda: changes == ["there", "left", "gone", "there"])
             router.kill()
-            until(lambda: len(changes) == 4)
-    assert changes[-1] == "cut off"
+            until(lambda: len(changes) == 6)
+    assert changes[-2:] == ["cut off", "gone"]
 
 
 def test_peers_lose_no_router(sessions):

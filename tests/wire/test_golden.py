@@ -22,6 +22,7 @@ from zstate.driving.messages import MotionOutcome
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.urdf import parse_urdf
 from zstate.net.sample_history import MAX_PAGE_BYTES
+from zstate.net.sites import SITE_TOKEN
 from zstate.stream_registry import all_streams, is_named, latched_streams, own_streams
 from zstate.streams import StreamName
 from zstate.wire import keys
@@ -334,7 +335,8 @@ def test_the_digest_in_the_page_is_that_of_its_names():
 
 
 def test_the_keys_of_the_page_are_those_of_the_code():
-    forms = {one.form for one in vars(keys).values() if isinstance(one, keys.Key)} | {keys.CLOCK_KEY}
+    rows = (*vars(keys).values(), SITE_TOKEN)
+    forms = {one.form for one in rows if isinstance(one, keys.Key)} | {keys.CLOCK_KEY}
     streams = [row for row in own_streams() if row.name not in ("clock", *STOP_STREAMS)]
     forms |= {f"zstate/<robot>/{row.name}" + "/<writer>" * row.named for row in streams}
     page = [row[0].strip("`").replace("<sensor>", "<writer>") for row in rows_of(section("Keys"))[2:]]

@@ -7,6 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
+from zstate.net.sites import SITE_TOKEN
 from zstate.wire import keys
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.native import NativeWire
@@ -58,7 +59,7 @@ PARSERS: tuple[Callable[[str], object], ...] = (
     keys.READER_TOKEN.parse,
     keys.WRITER_CLOCK.parse,
     keys.EDGE_TOKEN.parse,
-    keys.SITE_TOKEN.parse,
+    SITE_TOKEN.parse,
     keys.robot_from_key,
     WriterId.parse,
     NativeWire().edge_writer_name,
@@ -293,11 +294,11 @@ def test_the_token_of_a_site_has_its_rates_and_robots(
             keys.check_robot(name)
     except InvalidInput:
         return
-    token = keys.SITE_TOKEN.key(site, rates_hz, robots)
-    assert keys.SITE_TOKEN.parse(token) == (site, rates_hz, tuple(robots))
+    token = SITE_TOKEN.key(site, rates_hz, robots)
+    assert SITE_TOKEN.parse(token) == (site, rates_hz, tuple(robots))
 
 
 @pytest.mark.parametrize("rates", ["", "tf", "tf=0", "tf=nan", "tf=inf", "tf=-1.0", "=1.0", "a b=1.0"])
 def test_a_token_of_a_site_with_unusable_rates_is_refused(rates: str):
     with pytest.raises(InvalidInput, match="list of rates"):
-        keys.SITE_TOKEN.parse(f"zstate/@site/plant1/{rates}/r1")
+        SITE_TOKEN.parse(f"zstate/@site/plant1/{rates}/r1")

@@ -33,6 +33,7 @@ from zstate.archive.ledger import Entry, compacted_stem, newest_compaction
 from zstate.archive.scene import Scene, Track
 from zstate.archive.storage import Store, arrow, in_threads, numbers_of
 from zstate.buffer.buffer import TransformBuffer, feed_of
+from zstate.buffer.stored_samples import load_joints, load_poses
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput, LookupFailed, MessageError
 from zstate.model.joint_history import JointHistory
@@ -428,13 +429,13 @@ class Archive:
             if track is None:
                 covariances = _covariances(table)
                 triangles = None if covariances is None else covariances[rows]
-                feed.load_poses((parent, key), times[rows], _matrix(table, "", POSE, rows), triangles)
+                load_poses(feed, (parent, key), times[rows], _matrix(table, "", POSE, rows), triangles)
                 continue
             coordinates = coordinate_names(track.model)
             rates = tuple(coordinates[slot] for slot in velocity_columns_by_position(track.model))
             velocities = None if is_pruned else _known(table, "velocity.", rates, rows)
             positions = _matrix(table, "position.", coordinates, rows)
-            feed.load_joints(track, times[rows], positions, velocities)
+            load_joints(feed, track, times[rows], positions, velocities)
         return filled.buffer
 
     def _table(self, groups: Sequence[Group], columns: Sequence[str] | None) -> Any:

@@ -47,6 +47,7 @@ from zstate.archive.ledger import Ledger, record_path
 from zstate.archive.storage import Store, arrow, bytes_digest, file_digest
 from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer, feed_of
 from zstate.buffer.joint_samples import track_samples
+from zstate.buffer.stored_samples import take_before
 from zstate.buffer.tracks import JointTrack, PoseTrack
 from zstate.errors import InvalidInput
 from zstate.ingest.counters import Counters
@@ -467,7 +468,7 @@ class _RobotImport:
             newest = track.newest
             if newest is None:
                 continue
-            view = feed.take_before(track, newest + 1 if is_end else newest - DELAYED_NS)
+            view = take_before(feed, track, newest + 1 if is_end else newest - DELAYED_NS)
             if isinstance(track, JointTrack):
                 key = "" if track is robot else " ".join(track.model.joint_names)
                 present[PARTS if key else JOINTS, key] = ""

@@ -14,6 +14,7 @@ import numpy as np
 from zstate.archive.files import Files
 from zstate.archive.layout import EDGES, FRAMES, JOINTS, MODELS, PARTS, POSE, SUFFIX, folder_of
 from zstate.buffer.buffer import RECORDING_HISTORY_S, TransformBuffer, feed_of
+from zstate.buffer.stored_samples import load_poses
 from zstate.buffer.tracks import JointTrack
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.model.urdf import parse_urdf
@@ -78,7 +79,7 @@ class Scene:
         for transform, writer in self.statics:
             buffer.insert_static(transform, writer=writer)
         for edge in edges:
-            feed.load_poses(edge, np.zeros(1, np.int64), np.array([[0.0] * 6 + [1.0]]), None)
+            load_poses(feed, edge, np.zeros(1, np.int64), np.array([[0.0] * 6 + [1.0]]), None)
         return SceneBuffer(self, buffer, tracks)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from numbers import Real
@@ -11,19 +10,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.fork_safe import fork_safe
 from zstate._util.format import did_you_mean
-from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.feed import BufferFeed
-from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreePath
+from zstate.buffer.frame_tree import Edge, FrameInfo, PathDependencies, TreePath
 from zstate.buffer.history import insert_together, keep_only_around
 from zstate.buffer.history_view import HistoryView
 from zstate.buffer.path import TransformPath, compile_path
-from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
-from zstate.buffer.tracks import JointTrack, PoseTrack, Track, TrackOwner
-from zstate.buffer.waiting import WaiterRegistry
+from zstate.buffer.pose_tracks import EdgeNames, Poses, TooOld, check_poses, second_writer
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track
 from zstate.checks import check_names, name_problem
-from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.clock import Clock, check_stamp
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.model.robot import RobotModel
 from zstate.transform import UPPER_TRIANGLE, Transform
@@ -50,26 +46,14 @@ class BufferCore:
         self.history_s = history_s
         self.ignored = 0
         """The number of samples that were older than the history reaches."""
-        self._owner = TrackOwner()
-        self._span_ns = round(history_s * 1e9)
-        self._lock = fork_safe(threading.RLock())
+        inserts = type(self).insert_joints, type(self).insert_many
+        has_own_inserts = inserts != (BufferCore.insert_joints, BufferCore.insert_many)
+        feed = self._feed = BufferFeed(round(history_s * 1e9), clock, has_own_inserts=has_own_inserts)
+        self._lock, self._tree, self._owner = feed.lock, feed.tree, feed.owner
+        self._pose_tracks, self._waiters = feed.pose_tracks, feed.waiters
         self._writes = 0
-        self._tree = FrameTree(ClockDomain(None if clock is None else clock.domain))
-        self._waiters = WaiterRegistry(self._tree)
-        self._pose_tracks = PoseTrackTable(self._tree, self._span_ns, self._owner)
         self._paths: dict[tuple[str, str], CachedPath] = {}
         self._stop_reason = ""
-        inserts = type(self).insert_joints, type(self).insert_many
-        self._feed = BufferFeed(
-            self._tree,
-            self._pose_tracks,
-            self._waiters,
-            self._owner,
-            lock=self._lock,
-            clock=clock or SystemClock(),
-            span_ns=self._span_ns,
-            has_own_inserts=inserts != (BufferCore.insert_joints, BufferCore.insert_many),
-        )
 
     @property
     def clock(self) -> Clock:
@@ -90,7 +74,7 @@ class BufferCore:
             if problem := name_problem(prefix):
                 raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
             prefix = prefix.removesuffix("/")
-        track = JointTrack(model, prefix, self._span_ns)
+        track = JointTrack(model, prefix, self._feed.span_ns)
         track.owner = self._owner
         with self._lock, self._tree.transaction():
             if prefix and self._tree.robots.get(prefix) is not None:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
-from importlib import import_module
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.fork_safe import fork_safe
+from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.frame_tree import Edge, FrameTree, TreeSnapshot
-from zstate.buffer.history import FastPath, History, merged
-from zstate.buffer.history_view import HistoryView
+from zstate.buffer.history import FastPath, merged
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, checked_rows
 from zstate.buffer.tracks import ClockOffsets, JointTrack, PoseTrack, TrackOwner
 from zstate.buffer.waiting import Waiter, WaiterRegistry
-from zstate.checks import Floats
 from zstate.clock import Clock, SystemClock
 from zstate.errors import InsertRefused, InvalidInput
 
@@ -35,47 +35,36 @@ class BufferFeed:
     For the code that fills a buffer from a network or a file, which gets it from ``feed_of``. Samples are
     inserted by the methods of the buffer itself. Any method may be called from any thread.
 
-    ``tree``, ``pose_tracks``, ``waiters`` and ``owner`` are those of the buffer, which changes them while it
-    holds ``lock``. ``has_own_inserts`` is whether its class overrides the methods that insert samples, for
+    ``tree``, ``pose_tracks``, ``waiters`` and ``owner`` are the state of the buffer, which changes while
+    ``lock`` is held. ``has_own_inserts`` is whether its class overrides the methods that insert samples, for
     instance to measure them: then no sample gets in by another way.
     """
 
-    def __init__(
-        self,
-        tree: FrameTree,
-        pose_tracks: PoseTrackTable,
-        waiters: WaiterRegistry,
-        owner: TrackOwner,
-        *,
-        lock: AbstractContextManager[object],
-        clock: Clock,
-        span_ns: int,
-        has_own_inserts: bool,
-    ) -> None:
-        self.clock = clock
+    def __init__(self, span_ns: int, clock: Clock | None, *, has_own_inserts: bool) -> None:
+        self.span_ns = span_ns
+        self.clock = clock or SystemClock()
         """The clock of the buffer, by which it measures ages."""
-        self.domain = tree.domain
+        self.domain = ClockDomain(None if clock is None else clock.domain)
         """The clock domain of each robot."""
-        self._tree = tree
-        self._pose_tracks = pose_tracks
-        self._waiters = waiters
-        self._owner = owner
-        self._lock = lock
-        self._span_ns = span_ns
+        self.tree = FrameTree(self.domain)
+        self.owner = TrackOwner()
+        self.pose_tracks = PoseTrackTable(self.tree, span_ns, self.owner)
+        self.waiters = WaiterRegistry(self.tree)
+        self.lock = fork_safe(threading.RLock())
         self._has_own_inserts = has_own_inserts
 
     @property
     def clock_offsets(self) -> ClockOffsets:
         """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
-        return self._owner.clock_offsets
+        return self.owner.clock_offsets
 
     def set_recording(self) -> None:
         """The samples come from a file: no sample is added later."""
-        self._owner.is_recording = True
+        self.owner.is_recording = True
 
     def explain_unknown(self, hint: Callable[[int], str] | None) -> None:
         """Let errors about unknown frames end with ``hint(count)``, of the number of frames; "" is none."""
-        self._tree.hint = hint
+        self.tree.hint = hint
 
     def add_part(self, robot: JointTrack, joints: Sequence[str], writer: str | None = None) -> JointTrack:
         """A track for some ``joints`` of a robot, which one of its drivers publishes.
@@ -83,10 +72,10 @@ class BufferFeed:
         Its positions are in the order of ``joints``. It moves no edge before ``assign_joints``. Raises
         InvalidInput as ``RobotModel.part``, InsertRefused for a track that is not of this buffer.
         """
-        track = JointTrack(robot.model.part(joints), robot.prefix, self._span_ns)
-        with self._lock:
-            self._owner.check(robot)
-            track.owner, track.writer, track.model_writer = self._owner, writer, robot.model_writer
+        track = JointTrack(robot.model.part(joints), robot.prefix, self.span_ns)
+        with self.lock:
+            self.owner.check(robot)
+            track.owner, track.writer, track.model_writer = self.owner, writer, robot.model_writer
         return track
 
     def assign_joints(self, robot: JointTrack, parts: Mapping[str, JointTrack]) -> None:
@@ -95,33 +84,33 @@ class BufferFeed:
         Lookups read each joint, and the joints that mimic it, from the samples of its own part. Raises
         InsertRefused for a track that is not of this buffer.
         """
-        with self._lock:
-            self._owner.check(robot)
+        with self.lock:
+            self.owner.check(robot)
             robot.parts = dict(parts)
             for form, joint in zip(robot.forms, robot.model.joints, strict=True):
                 parent, child = robot.edge(form)
-                edge = self._tree.frames[child]
+                edge = self.tree.frames[child]
                 track = parts.get(robot.model.mimic_of(joint).joint, robot)
                 if form.kind != "fixed" and (edge is None or edge.track is not track):
                     index = [part.name for part in track.model.joints].index(joint.name)
-                    self._tree.attach(Edge(parent, child, "joint", track=track, index=index, robot=robot))
-        self._waiters.notify()
+                    self.tree.attach(Edge(parent, child, "joint", track=track, index=index, robot=robot))
+        self.waiters.notify()
 
     def name_robot(self, prefix: str) -> None:
         """Let inserts use bare names for frames ``prefix/...``, as they may for a robot's."""
-        with self._lock:
-            self._tree.robots.setdefault(prefix, None)
+        with self.lock:
+            self.tree.robots.setdefault(prefix, None)
 
     def add_frames(self, names: Iterable[str]) -> None:
         """Add frames by their full names, so that these names mean no robot's frames."""
-        with self._lock:
+        with self.lock:
             for name in names:
-                self._tree.add_frame(name)
+                self.tree.add_frame(name)
 
     def edge_named(self, names: EdgeNames) -> EdgeNames:
         """The full names of an edge, as an insert resolves them; a name that is not unique is unchanged."""
-        with self._lock, suppress(InsertRefused):
-            return self._tree.resolve_for_insert(names[0]), self._tree.resolve_for_insert(names[1])
+        with self.lock, suppress(InsertRefused):
+            return self.tree.resolve_for_insert(names[0]), self.tree.resolve_for_insert(names[1])
         return names
 
     def set_domain(self, robot: str, domain: str) -> bool:
@@ -133,12 +122,12 @@ class BufferFeed:
         return self._note_domain(lambda: self.domain.set_measured(robot, domain, ahead_ns))
 
     def _note_domain(self, change: Callable[[], bool]) -> bool:
-        with self._lock:
+        with self.lock:
             changed = change()
             if changed:
-                self._tree.version += 1
+                self.tree.version += 1
         if changed:
-            self._waiters.notify()
+            self.waiters.notify()
         return changed
 
     def insert_past_joints(
@@ -155,8 +144,8 @@ class BufferFeed:
         """
         stamps: list[int] = []
         rows: list[NDArray[np.float64]] = []
-        with self._lock:
-            self._owner.check(track)
+        with self.lock:
+            self.owner.check(track)
             oldest, newest = track.history.oldest, track.history.newest
             if oldest is None or newest is None or self._has_own_inserts:
                 return 0
@@ -177,8 +166,8 @@ class BufferFeed:
                 return 0
             times = np.array(stamps[::-1], dtype=np.int64)
             track.history = merged(track.history, times, np.array(rows[::-1]))
-            self._tree.invalidate(track)
-        self._waiters.notify(track)
+            self.tree.invalidate(track)
+        self.waiters.notify(track)
         return len(stamps)
 
     def insert_past_poses(
@@ -197,11 +186,11 @@ class BufferFeed:
         """
         past: dict[PoseTrack, _PastPoses] = {}
         count = 0
-        with self._lock:
-            version = self._tree.version
+        with self.lock:
+            version = self.tree.version
             for edges, stamp, poses, covariances in () if self._has_own_inserts else samples:
                 try:
-                    (track, rows), *others = self._pose_tracks.track_rows(edges, stamp, writer)
+                    (track, rows), *others = self.pose_tracks.track_rows(edges, stamp, writer)
                 except TooOld:
                     break
                 if others or (covariances is not None and not track.has_covariances):
@@ -217,74 +206,19 @@ class BufferFeed:
                 count += 1
             oldest = {track: track.history.oldest for track in past}
             is_between = any(at is not None and past[track].stamps[0] >= at for track, at in oldest.items())
-            if not is_between or self._tree.version != version:
+            if not is_between or self.tree.version != version:
                 return 0
             blocks = {track: checked_rows(track, one.poses, one.covariances) for track, one in past.items()}
             for track, one in past.items():
                 times = np.array(one.stamps[::-1], dtype=np.int64)
                 track.history = merged(track.history, times, blocks[track][::-1])
-                self._tree.invalidate(track)
-        self._waiters.notify(*past)
+                self.tree.invalidate(track)
+        self.waiters.notify(*past)
         return count
-
-    def take_before(self, track: JointTrack | PoseTrack, stamp: int) -> HistoryView:
-        """Remove the samples of ``track`` before ``stamp`` [ns] but the last; returns all of these.
-
-        What is left begins with that last one: a history that begins with another sample was restarted.
-        """
-        with self._lock:
-            view = track.history.view
-            end = view.first + int(view.kept_stamps().searchsorted(stamp))
-            taken = view._replace(end=end)
-            if taken.size > 1:
-                rest = view._replace(first=end - 1)
-                track.history.replace(rest.kept_stamps(), rest.kept_rows())
-        return taken
-
-    def load_joints(
-        self, track: JointTrack, stamps: NDArray[np.int64], positions: Floats, velocities: Floats | None
-    ) -> None:
-        """Set all samples of ``track``, which a buffer held before: no number is checked or changed.
-
-        ``stamps`` (T,) [ns] ascend; ``positions`` are (T, nq) and ``velocities`` (T, nv), NaN if not known.
-        """
-        with self._lock:
-            self._owner.check(track)
-            rows = positions
-            if velocities is not None and not track.has_velocities:
-                track.history = History(track.history.width + velocities.shape[1], self._span_ns)
-            if track.has_velocities:
-                if velocities is None:
-                    velocities = np.full((len(stamps), track.model.velocity_count), np.nan)
-                rows = np.hstack((positions, velocities))
-            track.history.replace(stamps, rows)
-            self._tree.invalidate(track)
-        self._waiters.notify(track)
-
-    def load_poses(
-        self, edge: EdgeNames, stamps: NDArray[np.int64], poses: Poses, covariances: Floats | None
-    ) -> None:
-        """Set all samples of a moving edge, which a buffer held before: no number is checked or changed.
-
-        ``stamps`` (T,) [ns] ascend, at least one; ``poses`` are (T, 7) and ``covariances`` (T, 21), NaN if
-        not known. Raises InsertRefused as ``insert_many``.
-        """
-        if covariances is not None:
-            import_module("zstate.buffer.covariance_path")  # here, not in a lookup later
-
-        with self._lock:
-            ((track, _),) = self._pose_tracks.track_rows((edge,), int(stamps[-1]), None)
-            rows = poses
-            if covariances is not None:
-                track.history = History(7 + covariances.shape[1], self._span_ns)
-                rows = np.hstack((poses, covariances))
-            track.history.replace(stamps, rows)
-            self._tree.invalidate(track)
-        self._waiters.notify(track)
 
     def fast_path(self, counts: dict[str, int], *sources: object) -> FastPath[Waiter]:
         """A fast path into this buffer for the messages of one writer, see ``FastPath``."""
-        return self._waiters.fast_path(counts, *sources)
+        return self.waiters.fast_path(counts, *sources)
 
     def expect_next(
         self,
@@ -301,32 +235,32 @@ class BufferFeed:
         if type(self.clock) is not SystemClock or self._has_own_inserts:
             return
         if not isinstance(place, JointTrack):
-            track = self._pose_tracks.whole_track(place)
+            track = self.pose_tracks.whole_track(place)
         else:
             track = place if place.has_plain_joints else None
         if track is not None:
-            self._waiters.expect_next(fast_path, track, message, versions)
+            self.waiters.expect_next(fast_path, track, message, versions)
 
     def restart(self, track: JointTrack | PoseTrack) -> None:
         """Begin a new epoch: remove the samples of one track, because its writer or its clock restarted.
 
         Raises InsertRefused for a track that is not of this buffer.
         """
-        with self._lock:
-            self._owner.check(track)
+        with self.lock:
+            self.owner.check(track)
             track.history.clear()
-        self._waiters.notify_restart(track)
+        self.waiters.notify_restart(track)
 
     def edge_of(self, frame: str) -> Edge | None:
         """The edge that places a frame, by its full name."""
-        with self._lock:
-            return self._tree.frames.get(frame)
+        with self.lock:
+            return self.tree.frames.get(frame)
 
     def is_model_root(self, frame: str) -> bool:
         """Whether a frame, by its full name, is the root of a robot's model."""
-        with self._lock:
+        with self.lock:
             ends = (at for at, letter in enumerate(frame) if letter == "/")
-            tracks = (self._tree.robots.get(frame[:end]) for end in (0, *ends))
+            tracks = (self.tree.robots.get(frame[:end]) for end in (0, *ends))
             return any(track is not None and track.frame(track.model.root) == frame for track in tracks)
 
     def edges_between(self, target: str, source: str) -> list[Edge]:
@@ -334,14 +268,14 @@ class BufferFeed:
 
         An edge that changes is replaced by another object.
         """
-        with self._lock:
-            to_target, to_source, *_ = self._tree.path(target, source)
+        with self.lock:
+            to_target, to_source, *_ = self.tree.path(target, source)
             return [*to_target, *to_source]
 
     def tree_snapshot(self) -> TreeSnapshot:
         """All frames with their edges and all robots with their tracks."""
-        with self._lock:
-            return self._tree.snapshot()
+        with self.lock:
+            return self.tree.snapshot()
 
     def use_clock(self, clock: Clock) -> None:
         """Measure ages with ``clock``. Raises InvalidInput if a clock of another domain was given before."""
@@ -352,4 +286,4 @@ class BufferFeed:
                 "give both the same, or a buffer without a clock"
             )
         self.clock, self.domain.given = clock, clock.domain
-        self._tree.version += 1  # ends the fast paths, which compare stamps with the system's clock
+        self.tree.version += 1  # ends the fast paths, which compare stamps with the system's clock

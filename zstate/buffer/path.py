@@ -40,7 +40,7 @@ from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
 from zstate.checks import Points
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
-from zstate.model.joint_forms import JointTransform
+from zstate.model.joint_forms import KINDS
 from zstate.transform import Kind, Transform
 
 if TYPE_CHECKING or kernel == "c":
@@ -58,8 +58,7 @@ TransformPair: TypeAlias = tuple[Transform, Transform]
 StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 """A step as the extension takes it: kind, track, column, whether the angle is continuous, numbers."""
 
-# In the order of the extension's StepKind and Failure.
-_KINDS = ("fixed", "revolute", "prismatic", "planar", "floating")
+# In the order of the extension's Failure.
 _FAILURES: tuple[type[LookupFailed], ...] = (InPast, NoData, InFuture)
 
 
@@ -469,21 +468,13 @@ def _step_tuples(steps: Sequence[Step], uses: Sequence[TrackUse]) -> tuple[StepT
             if isinstance(step, PoseStep):
                 numbers = se3.compose(before, step.origin)
             else:
-                kind, numbers = step.form.kind, _joint_numbers(step.form, before)
+                kind, numbers = step.form.kind, step.form.numbers(before)
             is_angle = isinstance(one, ContinuousAngleInterpolator)
-            tuples.append((_KINDS.index(kind), step.use, one.column, is_angle, numbers))
+            tuples.append((KINDS.index(kind), step.use, one.column, is_angle, numbers))
             before = se3.IDENTITY
     if before != se3.IDENTITY or not tuples:
         tuples.append((0, 0, 0, False, before))
     return tuple(tuples)
-
-
-def _joint_numbers(form: JointTransform, before: se3.Pose) -> tuple[float, ...]:
-    if form.kind == "planar":
-        return se3.compose(before, form.origin)
-    placed, q = se3.compose(before, (*form.t0, *form.q_cos)), before[3:]
-    axis = se3.multiply(q, form.q_sin) if form.kind == "revolute" else se3.rotate(q, form.t1)
-    return (form.scale, form.shift, *placed[3:], *placed[:3], *axis)
 
 
 def transforms_at_one_moment(

@@ -24,6 +24,7 @@ from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.security.credentials import check_identity
+from zstate.net.sites import SITE_TOKEN
 from zstate.net.user_config import user_config
 from zstate.stream_registry import all_streams, is_named, latched_streams, own_streams
 from zstate.wire.keys import (
@@ -32,7 +33,6 @@ from zstate.wire.keys import (
     MOTION,
     ODOMETRY_REQUEST,
     READER_TOKEN,
-    SITE_TOKEN,
     WRITER_CLOCK,
     WRITER_TOKEN,
     check_robot,

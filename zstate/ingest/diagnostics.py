@@ -68,8 +68,8 @@ class Diagnostics:
     def on_writer(self, announced: Announcement, *, alive: bool) -> None:
         """A writer is announced, or is not any more."""
 
-    def on_cut_off(self, announced: Announcement) -> None:
-        """A writer disappeared together with the router that connected it; ``on_writer`` follows."""
+    def before_losses(self) -> None:
+        """Tokens have disappeared together; ``on_writer`` follows for each of their writers."""
 
     def on_set_back(self, robot: str, session: int, text: str) -> None:
         """The clock of a writer was set back, as ``text`` describes."""

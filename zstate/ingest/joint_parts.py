@@ -10,6 +10,7 @@ accepted once the other writer has left. A writer of all joints keeps those that
 from __future__ import annotations
 
 import threading
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,7 +20,6 @@ from numpy.typing import ArrayLike
 
 from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
-from zstate.buffer.feed import BufferFeed
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, MessageError
 from zstate.ingest.base import ClockSetBack, StreamIngest
@@ -38,19 +38,6 @@ _MAX_SETS = 16
 def joint_order(model: RobotModel) -> JointOrder:
     """Reader of the joint states of robots with this model, or of the drivers of this part of one."""
     return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
-
-
-def insert_past(feed: BufferFeed, track: JointTrack, order: JointOrder, samples: Sequence[Sample]) -> int:
-    """Insert the first of ``samples``, newest first, with one copy of the track's history; how many."""
-    past: list[tuple[int, ArrayLike, ArrayLike | None]] = []
-    for sample in samples:
-        assert isinstance(sample, JointState)
-        try:
-            numbers = order.read(sample)
-        except MessageError:
-            break
-        past.append((sample.stamp, numbers.positions, numbers.velocities))
-    return feed.insert_past_joints(track, past)
 
 
 class JointNames:
@@ -123,7 +110,7 @@ class RobotParts:
         self._moments = count(1)
         self._lock = fork_safe(threading.RLock())
 
-    def set_model(self, track: JointTrack) -> None:
+    def set_model(self, track: JointTrack) -> JointPart:
         """Set the track of the whole robot. The parts of an earlier model have ended with it."""
         with self._lock:
             order = joint_order(track.model)
@@ -131,6 +118,7 @@ class RobotParts:
             self._joint_names = shared_joint_names(track.model)
             self._parts.clear()
             self._by_order.clear()
+            return self._whole
 
     def set_whole_writer(self, session: int | None) -> None:
         """Set the writer of all joints, None if there is none."""
@@ -259,7 +247,42 @@ class RobotParts:
         return self._names.get((self._robot, part.session or 0)) or f"a writer of session {part.session}"
 
 
-class PartialJointStateIngest(StreamIngest):
+class JointIngest(StreamIngest):
+    """Inserts joint states into the track of the part of the robot that they belong to."""
+
+    @abstractmethod
+    def _part(self, sample: Sample) -> JointPart | None:
+        """The part that a sample belongs to; None while the model is not known. Raises as ``_insert``."""
+
+    def _insert(self, sample: Sample) -> bool | None:
+        part = self._part(sample)
+        if part is None:
+            return None
+        assert isinstance(sample, JointState)
+        if sample.order == part.order.digest and sample.velocities is None:
+            return self._buffer.insert_joints(part.track, sample.stamp, sample.positions)
+        numbers = part.order.read(sample)
+        return self._buffer.insert_joints(part.track, sample.stamp, numbers.positions, numbers.velocities)
+
+    def _insert_past(self, samples: Sequence[Sample]) -> int:
+        part = self._part(samples[0])
+        if part is None:
+            return 0
+        past: list[tuple[int, ArrayLike, ArrayLike | None]] = []
+        for sample in samples:
+            assert isinstance(sample, JointState)
+            if sample.order != samples[0].order:
+                break
+            numbers = part.order.read(sample)
+            past.append((sample.stamp, numbers.positions, numbers.velocities))
+        return self._feed.insert_past_joints(part.track, past)
+
+    def _fast_place(self, sample: Sample) -> JointTrack | None:
+        part = self._part(sample)
+        return part.track if part is not None and sample.order == part.order.digest else None
+
+
+class PartialJointStateIngest(JointIngest):
     """Inserts the joint states of one driver, which publishes a part of the robot.
 
     ``others`` means that its messages may name joints that are not of the model, as in ROS.
@@ -283,36 +306,12 @@ class PartialJointStateIngest(StreamIngest):
         with self._lock:
             self._insert_early()
 
-    def _insert(self, sample: Sample) -> bool | None:
+    def _part(self, sample: Sample) -> JointPart | None:
         assert isinstance(sample, JointState)
-        part = self._parts.part_of(sample, others=self._others)
-        if part is None:
-            return None
-        if sample.order == part.order.digest and sample.velocities is None:
-            return self._buffer.insert_joints(part.track, sample.stamp, sample.positions)
-        numbers = part.order.read(sample)
-        return self._buffer.insert_joints(part.track, sample.stamp, numbers.positions, numbers.velocities)
-
-    def _insert_past(self, samples: Sequence[Sample]) -> int:
-        assert isinstance(samples[0], JointState)
-        part = self._parts.part_of(samples[0], others=self._others)
-        if part is None or any(sample.order != samples[0].order for sample in samples):
-            return 0
-        return insert_past(self._feed, part.track, part.order, samples)
-
-    def _fast_place(self, sample: Sample) -> JointTrack | None:
-        assert isinstance(sample, JointState)
-        part = self._parts.part_of(sample, others=self._others)
-        return part.track if part is not None and sample.order == part.order.digest else None
-
-    def _may_restart_epoch(self) -> bool:
-        return True  # other writers have tracks of their own
+        return self._parts.part_of(sample, others=self._others)
 
     def _drop_history(self) -> None:
         self._parts.restart(self.session or 0)
 
     def _remove(self) -> None:
         self._parts.drop(self.session or 0)
-
-    def _on_writer_changed(self) -> None:
-        pass  # ``RobotParts`` has the writers

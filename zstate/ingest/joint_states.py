@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
-from zstate.ingest.base import ClockSetBack, StreamIngest
+from zstate.ingest.base import ClockSetBack
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.joint_parts import RobotParts, insert_past, joint_order
+from zstate.ingest.joint_parts import JointIngest, JointPart, RobotParts
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.wire.joint_order import JointOrder
-from zstate.wire.messages import JointState, RobotDescription, Sample
+from zstate.wire.messages import RobotDescription, Sample
 
 
 @lru_cache(maxsize=16)
@@ -22,7 +20,7 @@ def _parsed(urdf: str) -> RobotModel:
     return parse_urdf(urdf, "its URDF")
 
 
-class JointStateIngest(StreamIngest):
+class JointStateIngest(JointIngest):
     """Inserts joint states as positions of the joints of the robot's model.
 
     ``parts`` has the drivers that publish only some of the joints.
@@ -35,8 +33,11 @@ class JointStateIngest(StreamIngest):
         self.parts = RobotParts(robot, ownership)
         self._digest = ""
         self._description_session: int | None = None
-        self._track: JointTrack | None = None
-        self._order = JointOrder(())
+        self._whole: JointPart | None = None
+
+    @property
+    def _track(self) -> JointTrack | None:
+        return None if self._whole is None else self._whole.track
 
     def describe(self, description: RobotDescription) -> None:
         self.has_data = True
@@ -58,29 +59,11 @@ class JointStateIngest(StreamIngest):
             self._insert_early()
 
     def _replace_model(self, model: RobotModel) -> None:
-        self._order = joint_order(model)
-        before, self._track = self._track, None
-        self._track = self._ownership.place_model(self.robot, model, before)
-        self.parts.set_model(self._track)
+        before, self._whole = self._track, None
+        self._whole = self.parts.set_model(self._ownership.place_model(self.robot, model, before))
 
-    def _insert(self, sample: Sample) -> bool | None:
-        track = self._track
-        if track is None:
-            return None
-        assert isinstance(sample, JointState)
-        if self._order.is_plain(sample):
-            return self._buffer.insert_joints(track, sample.stamp, sample.positions)
-        numbers = self._order.read(sample)
-        return self._buffer.insert_joints(track, sample.stamp, numbers.positions, numbers.velocities)
-
-    def _insert_past(self, samples: Sequence[Sample]) -> int:
-        return 0 if self._track is None else insert_past(self._feed, self._track, self._order, samples)
-
-    def _fast_place(self, sample: Sample) -> JointTrack | None:
-        return self._track if sample.order == self._order.digest else None
-
-    def _may_restart_epoch(self) -> bool:
-        return True  # a robot has one writer of joint states at a time
+    def _part(self, sample: Sample) -> JointPart | None:
+        return self._whole
 
     def _drop_history(self) -> None:
         if self._track is not None:

@@ -227,9 +227,6 @@ class TransformIngest(StreamIngest):
     def _may_restart_epoch(self) -> bool:
         return not any(map(self._ownership.others_move, (self._described, self._undescribed)))
 
-    def _on_writer_changed(self) -> None:
-        pass  # each sample is inserted under its writer's name
-
 
 class StaticTransformIngest:
     """Keeps exactly the static edges that one writer publishes now in a buffer.

@@ -13,12 +13,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from zstate.model.robot import Joint, Pose7, RobotModel, Vector3
-from zstate.se3 import SCALARS, multiply, normalize, rotate
+from zstate.se3 import SCALARS, Pose, compose, multiply, normalize, rotate
 
 EdgeKind = Literal["fixed", "revolute", "prismatic", "planar", "floating"]
+KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
+"""In the order of the extension's StepKind."""
+
 Quaternion = tuple[float, float, float, float]
 
 
@@ -46,6 +49,14 @@ class JointTransform:
     t1: Vector3
     origin: Pose7
     axis: Vector3
+
+    def numbers(self, before: Pose) -> tuple[float, ...]:
+        """The numbers of this edge in the extension, for ``before`` times ``parent_from_child``."""
+        if self.kind not in ("revolute", "prismatic"):
+            return compose(before, self.origin)
+        placed, q = compose(before, (*self.t0, *self.q_cos)), before[3:]
+        axis = multiply(q, self.q_sin) if self.kind == "revolute" else rotate(q, self.t1)
+        return (self.scale, self.shift, *placed[3:], *placed[:3], *axis)
 
 
 def edge_forms(model: RobotModel) -> tuple[JointTransform, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from zstate.checks import QUATERNION_TOLERANCE, Floats
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
-from zstate.model.joint_forms import EdgeKind, JointTransform, edge_forms
+from zstate.model.joint_forms import KINDS, JointTransform, edge_forms
 from zstate.model.robot import RobotModel
+from zstate.se3 import IDENTITY
 
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
@@ -101,13 +102,6 @@ def _writer(width: int, forms: tuple[JointTransform, ...]) -> Callable[[Floats, 
 
 
 def _compiled(width: int, forms: tuple[JointTransform, ...]) -> _kernel.Edges:
-    """The same formulas in the C extension, which expects the kinds in the order of ``EdgeKind``."""
-    kinds = get_args(EdgeKind)
-    edges: list[tuple[int, int, int, bool, tuple[float, ...]]] = []
-    for form in forms:
-        numbers: tuple[float, ...] = form.origin
-        if form.kind in ("revolute", "prismatic"):
-            along = form.q_sin if form.kind == "revolute" else form.t1
-            numbers = (form.scale, form.shift, *form.q_cos, *form.t0, *along)
-        edges.append((kinds.index(form.kind), 0, form.column, False, numbers))
+    """The same formulas in the C extension."""
+    edges = ((KINDS.index(form.kind), 0, form.column, False, form.numbers(IDENTITY)) for form in forms)
     return _kernel.Edges(width, tuple(edges))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from random import Random
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,15 +16,12 @@ from numpy.typing import ArrayLike
 from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.format import did_you_mean
 from zstate.checks import Floats
-from zstate.errors import InvalidInput, LibraryMissing, ModelError
+from zstate.errors import InvalidInput, LibraryMissing
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel
 
 if TYPE_CHECKING:
     from zstate.model.pinocchio_solver import PinocchioSolver
-
-_TOLERANCE = 1e-9
-"""The largest difference of Pinocchio and closed forms [m], or of numbers of a unit quaternion."""
 
 
 class Kinematics:
@@ -123,23 +119,23 @@ class MovingEdges:
     """
 
     def __init__(self, model: RobotModel, *, pinocchio: bool = True) -> None:
-        from zstate.model.pinocchio_solver import Engine, PinocchioSolver, closed_forms  # noqa: PLC0415 - as above
+        from zstate.model import pinocchio_solver as solvers  # noqa: PLC0415 - as above
 
-        self._model, self._table = model, JointTransforms(model)
+        self._table = JointTransforms(model)
         self._rows = np.flatnonzero([form.kind != "fixed" for form in self._table.forms])
         self.forms = tuple(self._table.forms[row] for row in self._rows)
         self._lock = fork_safe_lock()
         self._solver: PinocchioSolver | None = None
-        self.engine = Engine("closed forms")
+        self.engine = solvers.Engine("closed forms")
         if not pinocchio:
             return
         try:
-            self._solver = PinocchioSolver(model, self._table.forms)
+            self._solver = solvers.PinocchioSolver(model, self._table.forms)
             self.engine = self._solver.engine
         except LibraryMissing as error:
-            self.engine = closed_forms(error)
+            self.engine = solvers.closed_forms(error)
         else:
-            self._compare()
+            solvers.compare_with_closed_forms(model, self._table, self._solver)
 
     def poses(self, positions: Floats) -> Floats:
         """``parent_from_child`` of every moving edge: (M, 7), x y z [m], qx qy qz qw.
@@ -152,35 +148,6 @@ class MovingEdges:
         positions = self._table.normalised(positions)
         with self._lock:
             return self._solver.moving_edges(positions)
-
-    def _compare(self) -> None:
-        """Compare both ways at the neutral and three random configurations."""
-        draw = Random(self._model.digest)
-        for positions in (self._model.neutral, *(_random_positions(self._model, draw) for _ in range(3))):
-            expected, poses = self._table.poses(positions).take(self._rows, axis=0), self.poses(positions)
-            signs = np.sign(np.einsum("ij,ij->i", expected[:, 3:], poses[:, 3:]))
-            poses[:, 3:] *= signs[:, None]
-            differences = np.abs(poses - expected).max(axis=1, initial=0.0)
-            if not (differences <= _TOLERANCE).all():
-                row = int(differences.argmax())
-                edge = (self.forms[row].parent, self.forms[row].child)
-                joint = next(one for one in self._model.joints if (one.parent, one.child) == edge)
-                raise ModelError(
-                    self._model.name,
-                    message=f"{self.engine.name} and zstate's closed forms differ by {differences[row]:.3g} "
-                    f"at joint {joint.name!r} of {self._model.name!r}: {poses[row].tolist()} and "
-                    f"{expected[row].tolist()}; `pip install 'pin>=4.1,<5'` installs a release that zstate "
-                    "is tested with",
-                )
-
-
-def _random_positions(model: RobotModel, draw: Random) -> Floats:
-    positions = np.array([draw.uniform(-3.0, 3.0) for _ in range(model.position_count)])
-    for joint in model.driven_joints:
-        if joint.type == "floating":
-            start = model.columns[joint.name] + 3
-            positions[start : start + 4] /= np.linalg.norm(positions[start : start + 4])
-    return positions
 
 
 def _destination(out: Floats | None, rows: int) -> Floats:

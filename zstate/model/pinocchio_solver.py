@@ -10,21 +10,26 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from random import Random
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate.checks import Floats
-from zstate.errors import LibraryMissing
+from zstate.errors import LibraryMissing, ModelError
 from zstate.extension import kernel
 from zstate.model.joint_forms import JointTransform
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel
 
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
 
 Indices = NDArray[np.int64]
+
+_TOLERANCE = 1e-9
+"""The largest difference of Pinocchio and closed forms [m], or of numbers of a unit quaternion."""
 
 _SUPPORTED = "pip install 'pin>=4.1,<5'"
 _REINSTALL = "pip install --force-reinstall"
@@ -260,6 +265,39 @@ class PinocchioSolver:
                 command=_SUPPORTED,
             )
         return _Placements(memory, rows, np.array([_numbers(parent) for parent in parents]).reshape(-1, 12))
+
+
+def compare_with_closed_forms(model: RobotModel, table: JointTransforms, solver: PinocchioSolver) -> None:
+    """Compare the poses of both at the neutral and three random configurations.
+
+    Raises ModelError, which names the joint, if they differ by more than 1e-9.
+    """
+    draw = Random(model.digest)
+    rows = np.flatnonzero([form.kind != "fixed" for form in table.forms])
+    for drawn in (model.neutral, *(_random_positions(model, draw) for _ in range(3))):
+        positions = table.normalised(drawn)
+        expected, poses = table.poses(positions).take(rows, axis=0), solver.moving_edges(positions)
+        signs = np.sign(np.einsum("ij,ij->i", expected[:, 3:], poses[:, 3:]))
+        poses[:, 3:] *= signs[:, None]
+        differences = np.abs(poses - expected).max(axis=1, initial=0.0)
+        if not (differences <= _TOLERANCE).all():
+            row = int(differences.argmax())
+            joint = model.joints[int(rows[row])].name
+            raise ModelError(
+                model.name,
+                message=f"{solver.engine.name} and zstate's closed forms differ by {differences[row]:.3g} "
+                f"at joint {joint!r} of {model.name!r}: {poses[row].tolist()} and "
+                f"{expected[row].tolist()}; `{_SUPPORTED}` installs a release that zstate is tested with",
+            )
+
+
+def _random_positions(model: RobotModel, draw: Random) -> Floats:
+    positions = np.array([draw.uniform(-3.0, 3.0) for _ in range(model.position_count)])
+    for joint in model.driven_joints:
+        if joint.type == "floating":
+            start = model.columns[joint.name] + 3
+            positions[start : start + 4] /= np.linalg.norm(positions[start : start + 4])
+    return positions
 
 
 class _Placements(NamedTuple):

@@ -5,7 +5,6 @@ Also sets Zenoh's thread-pool sizes: enough that closing dead links does not blo
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import time
@@ -19,8 +18,6 @@ from zstate.net.at_exit import session_opening
 
 if TYPE_CHECKING:
     from zstate.net.security.credentials import Credentials
-
-_LOG = logging.getLogger("zstate")
 
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 RETRY_PERIOD_S = 0.1

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import socket
 import sys
@@ -19,7 +18,6 @@ from pathlib import Path
 import zenoh
 
 from zstate._util.closeable import Closeable
-from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ZStateError
 from zstate.net.queryable import MAX_REPLIES, Tokens, query_tokens
 from zstate.net.session import Session
@@ -36,10 +34,6 @@ CAPACITY = 16_384
 ANSWER_WITHIN_S = 0.5
 ALL_TOKENS_WITHIN_S = 5.0
 """Routers take a time that grows with the square of the number of tokens: half a second for 1000 robots."""
-
-_RECENT_S = 0.1
-_ROUTER_EVENT_S = 0.02
-_POLL_S = 0.002  # zenoh 1.10, channels have no receive with a timeout: delete when they have
 
 
 def local_writer(session: int, program: str = "") -> WriterId:
@@ -103,51 +97,12 @@ def _confirmed(session: Session, expression: str, timeout_s: float) -> Tokens:
     return found if found.keys else query_tokens(session.zenoh, expression, timeout_s)
 
 
-# zenoh 1.10, tokens behind a lost router are undeclared like those of ended writers: delete when they differ
-class RouterLossDetector(Closeable):
-    """The routers that a session is connected to. Has no thread: reads events when it is asked."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._routers: set[str] = set()
-        self._lost_at = -math.inf
-        self._lock = fork_safe_lock()
-        channel: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(256)
-        self._events = session.zenoh.info.declare_transport_events_listener(channel, history=True)
-
-    def lost_recently(self) -> bool:
-        """Whether a router was lost within the last tenth of a second.
-
-        Tokens behind a router disappear up to a millisecond before the event of its loss. Waits for that
-        event, up to 20 ms, if there is a router at all.
-        """
-        deadline = time.monotonic() + _ROUTER_EVENT_S
-        while True:
-            # The listener may be undeclared at the same time: then it has no events.
-            with self._lock, suppress(zenoh.ZError):
-                while (event := self._events.try_recv()) is not None:
-                    zid, is_router = str(event.transport.zid), event.transport.whatami == zenoh.WhatAmI.ROUTER
-                    if event.kind == zenoh.SampleKind.PUT and is_router:
-                        self._routers.add(zid)
-                    elif event.kind == zenoh.SampleKind.DELETE and zid in self._routers:
-                        self._routers.discard(zid)
-                        self._lost_at = time.monotonic()
-            if time.monotonic() - self._lost_at < _RECENT_S:
-                return True
-            if not self._routers or time.monotonic() > deadline:
-                return False
-            time.sleep(_POLL_S)
-
-    def close(self) -> None:
-        self._session.release(self._events)
-
-
 class WriterWatch(Receiver):
     """Watches the writers of ``robot`` ("*": of all robots; or of several), beginning with the current ones.
 
-    ``callback(announced, alive)`` is called from one thread. The loss of a router removes every writer behind
-    it; for these ``on_cut_off(announced)`` is called instead, if it is given. ``foreign`` counts tokens that
-    announce no stream of a robot, ``ignored`` those beyond the 100,000 that are kept. An exception of a
+    ``callback(announced, alive)`` is called from one thread, and ``before_losses()`` before those for writers
+    that disappeared together: the loss of a router removes every writer behind it. ``foreign`` counts tokens
+    that announce no stream of a robot, ``ignored`` those beyond the 100,000 that are kept. An exception of a
     callback is counted in ``failures``; the calls for other tokens still happen.
 
     A burst of tokens can overflow the ring between Zenoh and this thread. Nothing is lost by that: the
@@ -160,7 +115,7 @@ class WriterWatch(Receiver):
         robot: str | Sequence[str],
         callback: Callable[[Announcement, bool], None],
         wire: str | WriterTokens = "native",
-        on_cut_off: Callable[[Announcement], None] | None = None,
+        before_losses: Callable[[], object] = lambda: None,
     ) -> None:
         self.foreign = 0
         self.ignored = 0
@@ -168,8 +123,7 @@ class WriterWatch(Receiver):
         self._tokens_of: Counter[Announcement] = Counter()
         """A writer may announce a stream by more than one token."""
         self._callback = callback
-        self._on_cut_off = on_cut_off
-        self._routers = None if on_cut_off is None else RouterLossDetector(session)
+        self._before_losses = before_losses
         robots = (robot,) if isinstance(robot, str) else robot
         self._robot = robots[0] if len(robots) == 1 else ANY
         self._wire = get_wire(wire) if isinstance(wire, str) else wire
@@ -189,9 +143,9 @@ class WriterWatch(Receiver):
                 return
             changes = [(token, False) for token in known - current]
             changes += [(token, True) for token in current - known]
-        is_loss = any(not alive for _, alive in changes)
-        cut_off = is_loss and self._routers is not None and self._routers.lost_recently()
-        call_for_each(changes, lambda change: self._on_change(*change, cut_off=cut_off))
+        if not all(alive for _, alive in changes):
+            self._before_losses()
+        call_for_each(changes, lambda change: self._on_change(*change))
 
     def _current_tokens(self) -> set[str]:
         """All tokens, queried until the replies are complete: a token that a reply lacks may be alive."""
@@ -203,7 +157,7 @@ class WriterWatch(Receiver):
                 current |= tokens
         return current
 
-    def _on_change(self, token: str, alive: bool, *, cut_off: bool) -> None:
+    def _on_change(self, token: str, alive: bool) -> None:
         if alive == (token in self._known):
             return
         if alive and len(self._known) >= MAX_REPLIES:
@@ -220,12 +174,4 @@ class WriterWatch(Receiver):
             changed = [one for one in announced if not self._tokens_of[one]]
             for one in changed:
                 del self._tokens_of[one]
-        if cut_off and not alive and self._on_cut_off is not None:
-            call_for_each(changed, self._on_cut_off)
-        else:
-            call_for_each(changed, lambda one: self._callback(one, alive))
-
-    def close(self) -> None:
-        super().close()  # first: its thread uses the detector
-        if self._routers is not None:
-            self._routers.close()
+        call_for_each(changed, lambda one: self._callback(one, alive))

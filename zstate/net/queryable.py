@@ -26,7 +26,6 @@ from zstate.net.query_workers import QueryWorkers, leave_workers, use_workers
 from zstate.net.service_thread import JOIN_WITHIN_S
 from zstate.net.session import Session
 from zstate.net.streams import call_for_each
-from zstate.wire.keys import shortened
 
 MAX_REPLIES = 100_000
 """Limit of the replies to one query that are used. More are counted, and logged as a warning."""
@@ -153,9 +152,6 @@ class Queryable(Closeable):
     often that may have happened. After a full batch the thread pauses, so that a flood takes no more than a
     quarter of one processor. An exception of ``answer`` is counted in ``failures``, once for queries that
     arrived together, and the first goes to ``threading.excepthook``.
-
-    ``is_exact``: queries of another key expression, as with a wildcard, get an error reply. Requests that
-    change a node are, so that one query never changes several nodes.
     """
 
     def __init__(
@@ -164,15 +160,12 @@ class Queryable(Closeable):
         key: str,
         answer: Callable[[Mapping[str, str]], Reply | None],
         capacity: int = CAPACITY,
-        *,
-        is_exact: bool = False,
     ) -> None:
         self.answered = self.full_batches = self.failures = 0
         self._session = session
         self._key = key
         self._answer = answer
         self._capacity = capacity
-        self._is_exact = is_exact
         self._lock = fork_safe_lock()
         self._queries: list[zenoh.Query] = []
         self._has_turn = False
@@ -274,10 +267,6 @@ class Queryable(Closeable):
             self.answered += 1
 
     def _reply_to(self, received: zenoh.Query) -> Reply | None:
-        if self._is_exact and str(received.key_expr) != self._key:
-            asked = shortened(str(received.key_expr))
-            text = f"a request is for one key, such as {self._key!r}, not for {asked!r}"
-            return Reply(text.encode(), "text/plain", is_error=True)
         return self._answer(parse_parameters(str(received.parameters)))
 
 

@@ -1,4 +1,4 @@
-"""Queryables whose queries carry a message, and may be answered later."""
+"""Queryables of requests, which change a node: of one key alone, or with a message."""
 
 from __future__ import annotations
 
@@ -12,8 +12,23 @@ import zenoh
 
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
+from zstate.wire.keys import shortened
 
 RequestAnswer: TypeAlias = "Reply | Future[Reply | None] | None"
+
+
+class ExactQueryable(Queryable):
+    """As ``Queryable``, but queries of another key expression, as with a wildcard, get an error reply.
+
+    So one request never changes several nodes.
+    """
+
+    def _reply_to(self, received: zenoh.Query) -> Reply | None:
+        if str(received.key_expr) != self._key:
+            asked = shortened(str(received.key_expr))
+            text = f"a request is for one key, such as {self._key!r}, not for {asked!r}"
+            return Reply(text.encode(), "text/plain", is_error=True)
+        return super()._reply_to(received)
 
 
 class RequestQueryable(Queryable):

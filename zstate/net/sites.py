@@ -6,10 +6,12 @@ of sites.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote, unquote
 
 import zenoh
 
@@ -21,7 +23,7 @@ from zstate.net.session import Session
 from zstate.net.streams import Receiver
 from zstate.stream_registry import find_stream
 from zstate.streams import StreamName
-from zstate.wire.keys import SITE_TOKEN
+from zstate.wire.keys import Chunk, Key, check_robot, shortened
 
 if TYPE_CHECKING:
     from zstate.net.topic_statistics import Window
@@ -29,12 +31,53 @@ if TYPE_CHECKING:
 _TOKEN_LENGTH = 4000
 """The length of the names in one token. Keys may be longer, but each router keeps them."""
 
-
 UPLINK_OF = "uplink of "
 """What the names of the rules of an uplink begin with, before that of the site."""
 
 _MOST = 1.25
 """The largest ratio of a measured to the thinned rate."""
+
+_NO_RATE = "none"
+
+
+def _write_rates(rates_hz: Mapping[StreamName, float]) -> str:
+    return ",".join(f"{stream}={rate_hz!r}" for stream, rate_hz in rates_hz.items()) or _NO_RATE
+
+
+def _read_rates(chunk: str) -> dict[StreamName, float]:
+    pairs = [] if chunk == _NO_RATE else [pair.partition("=") for pair in chunk.split(",")]
+    try:
+        rates_hz = {stream: float(rate) for stream, _, rate in pairs}
+    except ValueError:
+        rates_hz = {"": 0.0}
+    if not all(stream.isidentifier() and 0.0 < rate < math.inf for stream, rate in rates_hz.items()):
+        raise InvalidInput(f"{shortened(chunk)!r} is not a list of rates such as 'joint_states=5.0,imu=1.0'")
+    return rates_hz
+
+
+def _write_robots(robots: Sequence[str]) -> str:
+    return ",".join(quote(robot, safe="") for robot in robots)
+
+
+def _read_robots(chunk: str) -> tuple[str, ...]:
+    return tuple(check_robot(unquote(name)) for name in chunk.split(","))
+
+
+def _check_site(name: str) -> str:
+    return check_robot(name, "site")
+
+
+SITE_TOKEN = Key[str, Mapping[StreamName, float], Sequence[str]](
+    "zstate/@site/<site>/<rates>/<robots>",
+    site=Chunk(_check_site, _check_site),
+    rates=Chunk(_write_rates, _read_rates),
+    robots=Chunk(_write_robots, _read_robots),
+)
+"""The liveliness token of the router of a site, which thins what leaves on its uplink.
+
+Of each of the robots, these streams pass at these rates [Hz], and no other samples. A site with many robots
+has several tokens.
+"""
 
 
 class Thinning(NamedTuple):

@@ -24,10 +24,6 @@ from zstate.wire.native import encode, encoding_of
 
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
-MAX_STATUS_BYTES = 65_536
-
-_RECENT_S = 3.0 * PERIOD_S
-"""Publishers whose last status is older are gone, frozen or unreachable."""
 
 
 class StatusPublisher(Closeable):

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Collection
+from functools import partial
 
 from zstate.buffer.buffer import TransformBuffer, check_duration, feed_of
 from zstate.buffer.frame_tree import Edge
 from zstate.clock import check_stamp, wait_interruptible
 from zstate.errors import InFuture, InPast, LookupFailed, Unreachable, as_timeout
+from zstate.ingest.base import StreamIngest
 from zstate.nodes.state_reader import StateReader
 from zstate.streams import JOINT_STREAMS
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import frame_owner
+from zstate.wire.messages import Sample
 
 _ROUND_S = 0.05
 """Between two requests for an instant that the writers have not reached yet."""
@@ -56,7 +60,7 @@ class ExactLookup:
         """Why the pose at ``stamp`` is not known exactly, after the writers were asked; None if it is."""
         edges = [one for one in feed_of(self._buffer).edges_between(target, source) if one.track is not None]
         writers = {edge.names: self._writers_of(edge) for edge in edges}
-        spans = self._reader.recall({one for found in writers.values() for one in found}, stamp, timeout_s)
+        spans = self._recall({one for found in writers.values() for one in found}, stamp, timeout_s)
         for edge in edges:
             found = [spans.get(one) for one in writers[edge.names]] or [None]
             for span in found:
@@ -76,6 +80,35 @@ class ExactLookup:
                 reason.note = _IS_ALL if kind is InPast else ""
                 return reason
         return None
+
+    def _recall(
+        self, writers: Collection[Announcement], stamp: int, timeout_s: float
+    ) -> dict[Announcement, tuple[int, int]]:
+        """Request the samples that ``writers`` cached, back to ``stamp`` [ns], and insert them.
+
+        Returns the oldest and the newest of their stamps, between which nothing is missing, of each writer
+        that replied within ``timeout_s`` [s].
+        """
+        spans: dict[Announcement, tuple[int, int]] = {}
+        waiting, done = len(writers), threading.Event()
+
+        def on_samples(one: Announcement, ingest: StreamIngest, samples: list[Sample]) -> bool:
+            ingest.insert_history(samples, are_missing=True)
+            oldest, newest = samples[0].stamp, samples[-1].stamp
+            spans[one] = oldest, max(newest, spans.get(one, (0, newest))[1])
+            return oldest > stamp
+
+        def on_done() -> None:
+            nonlocal waiting
+            waiting -= 1
+            if waiting <= 0:
+                done.set()
+
+        for one in writers:
+            self._reader.request_history(one, partial(on_samples, one), on_done)
+        if writers:
+            wait_interruptible(done, timeout_s)
+        return spans.copy()
 
     def _writers_of(self, edge: Edge) -> list[Announcement]:
         """The announced writers that may have placed ``edge``; one process writes for many robots."""

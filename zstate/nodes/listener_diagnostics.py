@@ -14,6 +14,7 @@ from zstate.ingest.events import EventLog
 from zstate.ingest.frame_ownership import EdgeSource
 from zstate.ingest.robot_ingests import Follow, sample_streams
 from zstate.ingest.stamp_checks import StampCheck
+from zstate.net.router_losses import RouterLossDetector
 from zstate.net.service_thread import ServiceThread
 from zstate.net.session import Session
 from zstate.net.sites import Sites, SiteWatch
@@ -51,6 +52,7 @@ class ListenerDiagnostics(Diagnostics, Closeable):
         streams: tuple[StreamName, ...] = ("robot_description", "tf_static", *self._streams)
         self._events = EventLog(streams, follow, wire.shared, on_event)
         self._has_deadlines = on_event is not None
+        self._routers, self._are_cut_off = RouterLossDetector(session), False
         self._sites: SiteWatch | None = None
         if self._has_deadlines:
             self.on_usual_sample = self._events.on_sample
@@ -60,6 +62,7 @@ class ListenerDiagnostics(Diagnostics, Closeable):
     def close(self) -> None:
         if self._sites is not None:
             self._sites.close()
+        self._routers.close()
         self._events.close()
 
     def events(self) -> tuple[WriterEvent, ...]:
@@ -76,7 +79,12 @@ class ListenerDiagnostics(Diagnostics, Closeable):
             if not earliest <= sample.stamp <= latest:
                 self._stamp_check.check(robot, writers.get((robot, sample.session)), sample)
 
+    def before_losses(self) -> None:
+        self._are_cut_off = self._routers.lost_recently()
+
     def on_writer(self, announced: Announcement, *, alive: bool) -> None:
+        if self._are_cut_off and not alive:
+            self._events.on_cut_off(announced)
         self._events.on_writer(announced, alive)
         if self._clocks is not None and announced.stream in self._streams:
             watch = self._clocks.watch if alive else self._clocks.unwatch
@@ -86,9 +94,6 @@ class ListenerDiagnostics(Diagnostics, Closeable):
         self._events.set_thinned(sites.periods_s(self._follow))
         if self._clocks is not None:
             self._clocks.on_sites(sites)
-
-    def on_cut_off(self, announced: Announcement) -> None:
-        self._events.on_cut_off(announced)
 
     def on_set_back(self, robot: str, session: int, text: str) -> None:
         self._events.add_set_back(robot, session, text)

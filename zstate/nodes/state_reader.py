@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import FAR_NS, LATE_NS, SystemClock, wait_interruptible
+from zstate.clock import FAR_NS, LATE_NS, SystemClock
 from zstate.errors import InvalidInput, MessageError
 from zstate.extension import kernel
 from zstate.ingest.base import StreamIngest
@@ -29,7 +28,7 @@ from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.stream_registry import is_named
 from zstate.streams import StreamName
 from zstate.wire.identity import Announcement
-from zstate.wire.keys import ANY, MODEL_WRITER, shortened, stream_from_key, stream_key
+from zstate.wire.keys import ANY, MODEL_WRITER, shortened, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample, Wire
 
@@ -76,7 +75,6 @@ class StateReader(Closeable):
         )
         self._has_history = history_on_join
         self._requests = Requests(session, thread, MAX_IN_FLIGHT)
-        self._on_page = self._observed(self._on_history)
         self._announced: set[Announcement] = set()
         """The writers with a cache of samples."""
         self._observers: tuple[Callable[[], object], ...] = ()
@@ -91,8 +89,8 @@ class StateReader(Closeable):
                 )
             self._other_tf = self._subscribe_to_samples(opening)
             # History is requested from each writer found: after subscribing, so that no sample falls between.
-            on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
-            opening.enter_context(WriterWatch(session, robots, on_writer, wire, on_cut_off))
+            on_writer, before_losses = self._observed(self._on_writer), self._diagnostics.before_losses
+            opening.enter_context(WriterWatch(session, robots, on_writer, wire, before_losses))
             for name in robots:
                 for announcement in announce_reader(session, wire, name, (*latched, *self.ingests.streams)):
                     opening.enter_context(announcement)
@@ -195,62 +193,33 @@ class StateReader(Closeable):
         """The writers of samples that may have a cache."""
         return frozenset(self._announced.copy())
 
-    def recall(
-        self, writers: Collection[Announcement], stamp: int, timeout_s: float
-    ) -> dict[Announcement, tuple[int, int]]:
-        """Request the samples that ``writers`` cached, back to ``stamp`` [ns], and insert them.
+    def request_history(
+        self,
+        writer: Announcement,
+        on_samples: Callable[[StreamIngest, list[Sample]], bool],
+        on_done: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Request the samples that a writer has cached, page by page from the newest.
 
-        Returns the oldest and the newest of their stamps, between which nothing is missing, of each writer
-        that replied within ``timeout_s`` [s].
+        ``on_samples(ingest, samples)`` is called with those of a page, oldest first, in the thread of the
+        reader, and returns whether older ones are wanted; ``on_done()`` is called once no more follow.
         """
-        spans: dict[Announcement, tuple[int, int]] = {}
-        waiting, done = len(writers), threading.Event()
+        robot, stream = writer.robot, writer.stream
 
-        def on_page(one: Announcement, arrivals: list[SerializedSample], writer: int) -> bool:
-            samples = self._read_history(arrivals, writer)
+        def on_page(arrivals: list[SerializedSample], session: int) -> bool:
+            messages = (message for one in arrivals for message in self._decode(stream, one, robot))
+            samples = [message for message in messages if isinstance(message, Sample)]
+            if any(sample.session != session for sample in samples):
+                text = f"{robot!r}: samples of another session than {session}, whose history was requested"
+                self._counters.count_refusal("foreign answer", text)
+                return False
             if not samples:
                 return False
-            self._ingest_of(arrivals[0].key, writer).insert_history(samples, are_missing=True)
-            oldest, newest = samples[0].stamp, samples[-1].stamp
-            spans[one] = oldest, max(newest, spans.get(one, (0, newest))[1])
-            return oldest > stamp
+            return on_samples(self.ingests.find(self.ingests.streams[stream], robot, session), samples)
 
-        def on_done() -> None:
-            nonlocal waiting
-            waiting -= 1
-            if waiting <= 0:
-                done.set()
-
-        for one in writers:
-            key = stream_key(one.robot, one.stream, one.name)
-            on_page_of = self._observed(partial(on_page, one))
-            session = one.writer.session
-            self._requests.add(HistoryRequest(key, session, on_page_of, self._count_undecodable, on_done))
-        if writers:
-            wait_interruptible(done, timeout_s)
-        return spans.copy()
-
-    def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
-        """Insert a page of the cache of the session ``writer``; True if older samples are wanted."""
-        samples = self._read_history(arrivals, writer)
-        return bool(samples) and self._ingest_of(arrivals[0].key, writer).insert_history(samples)
-
-    def _ingest_of(self, key: str, writer: int) -> StreamIngest:
-        return self.ingests.find(
-            self.ingests.streams[stream_from_key(key)], self._robot_from_key(key), writer
-        )
-
-    def _read_history(self, arrivals: list[SerializedSample], writer: int) -> list[Sample]:
-        """The samples of a page of the cache of the session ``writer``; none if they are of another one."""
-        robot = self._robot_from_key(arrivals[0].key)  # the key of the request
-        stream = stream_from_key(arrivals[0].key)
-        messages = (message for one in arrivals for message in self._decode(stream, one, robot))
-        samples = [message for message in messages if isinstance(message, Sample)]
-        if any(sample.session != writer for sample in samples):
-            text = f"{robot!r}: samples of another session than {writer}, whose history was requested"
-            self._counters.count_refusal("foreign answer", text)
-            return []
-        return samples
+        key, page = stream_key(robot, stream, writer.name), self._observed(on_page)
+        session = writer.writer.session
+        self._requests.add(HistoryRequest(key, session, page, self._count_undecodable, on_done))
 
     def _on_description(self, arrival: SerializedSample) -> None:
         try:
@@ -297,28 +266,22 @@ class StateReader(Closeable):
     def _count_foreign(self, key: str, error: InvalidInput) -> None:
         self._counters.count_refusal("foreign", f"{shortened(key)}: {error}")
 
-    def _on_cut_off(self, announced: Announcement) -> None:
-        self._diagnostics.on_cut_off(announced)
-        self._on_writer(announced, alive=False)
-
     def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if self._other_tf is not None:
             self._other_tf.on_writer(announced, alive=alive)
         if alive:
             self.ingests.add_writer(announced)
-            self._request_history(announced)
+            if self._has_cache(announced):
+                self._announced.add(announced)
+                if self._has_history:
+                    self.request_history(announced, StreamIngest.insert_history)
         else:
             self._announced.discard(announced)
             self.ingests.remove_writer(announced)
 
-    def _request_history(self, announced: Announcement) -> None:
-        """Request the samples that an announced writer has cached."""
+    def _has_cache(self, announced: Announcement) -> bool:
+        """Whether an announced writer may have cached samples, on a key that is known."""
         stream = announced.stream
         # A token without a name leaves open on which key of a named stream its writer publishes.
         has_key = bool(announced.name) or not is_named(stream)
-        if self._wire.name != "native" or stream not in self.ingests.streams or not has_key:
-            return
-        self._announced.add(announced)
-        if self._has_history:
-            key, session = stream_key(announced.robot, stream, announced.name), announced.writer.session
-            self._requests.add(HistoryRequest(key, session, self._on_page, self._count_undecodable))
+        return self._wire.name == "native" and stream in self.ingests.streams and has_key

@@ -23,7 +23,8 @@ from zstate.errors import Closed, InPast, InvalidInput, NoData, SecondWriter
 from zstate.model.robot import POSITION_COUNTS, RobotModel
 from zstate.net.latched import cached_values
 from zstate.net.presence import announce_reader
-from zstate.net.queryable import Queryable, Reply
+from zstate.net.queryable import Reply
+from zstate.net.request_queryable import ExactQueryable
 from zstate.net.session import Session
 from zstate.net.subscription import Received, decode_samples, subscribe
 from zstate.nodes.transform_publisher import TransformPublisher
@@ -262,7 +263,7 @@ class OdometryNode(Closeable):
                 self._share_datum(opening, session)
             self._publish_datum()
             request_key = ODOMETRY_REQUEST.key(robot, self._publisher.writer)
-            opening.enter_context(Queryable(session, request_key, self._on_request, is_exact=True))
+            opening.enter_context(ExactQueryable(session, request_key, self._on_request))
             if has_joints:
                 joints = JointStateListener(session, robot, on_reading=self._on_joints, wire=wires[0])
                 self._joints = opening.enter_context(joints)

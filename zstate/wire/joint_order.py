@@ -42,10 +42,6 @@ class JointOrder:
         self._plain = np.arange(len(self._coordinates)), np.arange(len(self._slots))
         self._permutations: dict[tuple[str, ...], tuple[_Indices, _Indices]] = {}
 
-    def is_plain(self, state: JointState) -> bool:
-        """Whether ``state`` has only positions, in the reader's order: the usual case."""
-        return state.order == self.digest and state.names is state.velocities is state.efforts is None
-
     def read(self, state: JointState) -> JointNumbers:
         """The numbers of ``state`` in the reader's order. Raises MessageError if any is missing."""
         positions = from_block(state.positions)

@@ -1,8 +1,9 @@
 """The native key space: one prefix for each robot, one chunk for its name.
 
 A stream has the key ``zstate/<robot>/<stream>``, or ``zstate/<robot>/<stream>/<writer>`` if its writers have
-names (``stream_key``); the simulated time has ``zstate/clock``. All other keys are a ``Key`` below. The table
-in docs/wire.md has all of them, with what is sent on each.
+names (``stream_key``); the simulated time has ``zstate/clock``. All other keys are a ``Key`` below, but for
+the token of a site (``zstate.net.sites``). The table in docs/wire.md has all of them, with what is sent on
+each.
 
 ``<identity>`` is that of a writer or reader, already one chunk; ``<streams>`` are joined by commas. A writer
 has one token for all, because what tokens cost a router grows with the square of their number.
@@ -10,8 +11,7 @@ has one token for all, because what tokens cost a router grows with the square o
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVarTuple, cast
 from urllib.parse import quote, unquote
@@ -129,7 +129,7 @@ def _split(chunk: str) -> tuple[StreamName, ...]:
     return streams
 
 
-class _Chunk(NamedTuple):
+class Chunk(NamedTuple):
     """How a value is written as one chunk of a key, and read from it."""
 
     write: Callable[[Any], str]
@@ -145,44 +145,14 @@ def _read_reader_robot(chunk: str) -> str:
 
 
 _NAME_CHUNKS = {
-    "robot": _Chunk(check_robot, check_robot),
-    "writer": _Chunk(check_writer, check_writer),
-    "identity": _Chunk(str, str),
-    "streams": _Chunk(_joined, _split),
-    "child": _Chunk(_quoted, unquote),
-    "parent": _Chunk(_quoted, unquote),
+    "robot": Chunk(check_robot, check_robot),
+    "writer": Chunk(check_writer, check_writer),
+    "identity": Chunk(str, str),
+    "streams": Chunk(_joined, _split),
+    "child": Chunk(_quoted, unquote),
+    "parent": Chunk(_quoted, unquote),
 }
-_READER_ROBOT = _Chunk(_quoted, _read_reader_robot)
-
-_NO_RATE = "none"
-
-
-def _write_rates(rates_hz: Mapping[StreamName, float]) -> str:
-    return ",".join(f"{stream}={rate_hz!r}" for stream, rate_hz in rates_hz.items()) or _NO_RATE
-
-
-def _read_rates(chunk: str) -> dict[StreamName, float]:
-    pairs = [] if chunk == _NO_RATE else [pair.partition("=") for pair in chunk.split(",")]
-    try:
-        rates_hz = {stream: float(rate) for stream, _, rate in pairs}
-    except ValueError:
-        rates_hz = {"": 0.0}
-    if not all(stream.isidentifier() and 0.0 < rate < math.inf for stream, rate in rates_hz.items()):
-        raise InvalidInput(f"{shortened(chunk)!r} is not a list of rates such as 'joint_states=5.0,imu=1.0'")
-    return rates_hz
-
-
-def _write_robots(robots: Sequence[str]) -> str:
-    return ",".join(map(_quoted, robots))
-
-
-def _read_robots(chunk: str) -> tuple[str, ...]:
-    return tuple(check_robot(unquote(name)) for name in chunk.split(","))
-
-
-def _check_site(name: str) -> str:
-    return check_robot(name, "site")
-
+_READER_ROBOT = Chunk(_quoted, _read_reader_robot)
 
 Values = TypeVarTuple("Values")
 
@@ -193,7 +163,7 @@ class Key(Generic[*Values]):
     ``check`` raises InvalidInput for parsed values that are invalid together.
     """
 
-    def __init__(self, form: str, check: Callable[[*Values], None] | None = None, **chunks: _Chunk) -> None:
+    def __init__(self, form: str, check: Callable[[*Values], None] | None = None, **chunks: Chunk) -> None:
         self.form = form
         self._check = check
         self._form = form.split("/")
@@ -269,18 +239,6 @@ READER_TOKEN = Key[str, Sequence[StreamName], str](
     "zstate/@reader/<robot>/<streams>/<identity>", robot=_READER_ROBOT
 )
 """The liveliness token of one reader of a robot or of all, ``"*"``. Readers write below no robot's prefix."""
-
-SITE_TOKEN = Key[str, Mapping[StreamName, float], Sequence[str]](
-    "zstate/@site/<site>/<rates>/<robots>",
-    site=_Chunk(_check_site, _check_site),
-    rates=_Chunk(_write_rates, _read_rates),
-    robots=_Chunk(_write_robots, _read_robots),
-)
-"""The liveliness token of the router of a site, which thins what leaves on its uplink.
-
-Of each of the robots, these streams pass at these rates [Hz], and no other samples. A site with many robots
-has several tokens.
-"""
 
 STOP = Key[str, str]("zstate/<robot>/stop/<identity>")
 """The Stop of one program, latched: the driver's joints hold."""

@@ -221,7 +221,7 @@ def _environment(session_options: Mapping[str, Any]) -> dict[str, str]:
 
 def _swinging_robot(source: str, xacro_args: Mapping[str, str], names: _Names) -> Demo:
     """A robot whose joints swing, published by one program."""
-    from zstate.model.robot import representative_links
+    from zstate.model.representative_links import representative_links
 
     try:
         model, name = load_robot(source, None, xacro_args)

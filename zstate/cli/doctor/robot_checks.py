@@ -13,7 +13,8 @@ from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
 from zstate.errors import InvalidInput, LookupFailed, ModelError, format_duration
 from zstate.model.joint_limits import JointLimits
-from zstate.model.robot import RobotModel, coordinate_names, representative_links
+from zstate.model.representative_links import representative_links
+from zstate.model.robot import RobotModel, coordinate_names
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.net.topic_statistics import Window

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from zstate import load_model
-from zstate.model.robot import representative_links
+from zstate.model.representative_links import representative_links
 
 
 def test_representative_links_are_ends_of_branches_and_links_between():

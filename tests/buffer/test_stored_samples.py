@@ -7,6 +7,7 @@ from helpers.robots import RRBOT
 
 from zstate import TransformBuffer
 from zstate.buffer.buffer import feed_of
+from zstate.buffer.stored_samples import load_joints, load_poses, take_before
 
 
 def swinging(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -26,10 +27,10 @@ def test_what_is_taken_from_a_track_gives_the_same_lookups_elsewhere():
     instants = np.arange(0, 49_000, 333)
     expected = one.lookup_many("map", "tool", instants)
     twist = one.twist("tool", "map", 5_500)
-    view, poses = feed_of(one).take_before(track, 10**9), feed_of(one).take_before(edge.track, 10**9)
+    view, poses = take_before(feed_of(one), track, 10**9), take_before(feed_of(one), edge.track, 10**9)
     rows = view.kept_rows()
-    feed_of(other).load_joints(loaded, view.kept_stamps(), rows[:, :2], rows[:, 2:])
-    feed_of(other).load_poses(("map", "world"), poses.kept_stamps(), poses.kept_rows(), None)
+    load_joints(feed_of(other), loaded, view.kept_stamps(), rows[:, :2], rows[:, 2:])
+    load_poses(feed_of(other), ("map", "world"), poses.kept_stamps(), poses.kept_rows(), None)
     found = other.lookup_many("map", "tool", instants)
     assert expected[1].all()
     assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
@@ -43,9 +44,9 @@ def test_the_last_sample_that_is_taken_stays_as_the_first():
     for stamp, row in zip(stamps.tolist(), positions, strict=True):
         buffer.insert_joints(track, stamp, row)
     feed = feed_of(buffer)
-    assert feed.take_before(track, 20_001).kept_stamps().tolist() == stamps[:21].tolist()
-    assert feed.take_before(track, 20_001).kept_stamps().tolist() == [20_000]
-    assert feed.take_before(track, 0).size == 0
+    assert take_before(feed, track, 20_001).kept_stamps().tolist() == stamps[:21].tolist()
+    assert take_before(feed, track, 20_001).kept_stamps().tolist() == [20_000]
+    assert take_before(feed, track, 0).size == 0
     assert buffer.joint_states(RRBOT.name).stamps.tolist() == stamps[20:].tolist()
 
 
@@ -53,5 +54,5 @@ def test_loaded_edges_keep_their_covariances():
     buffer = TransformBuffer(1e6)
     covariance = np.eye(6)[np.triu_indices(6)]
     pose = [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
-    feed_of(buffer).load_poses(("map", "base"), np.array([5]), np.array(pose), covariance[None])
+    load_poses(feed_of(buffer), ("map", "base"), np.array([5]), np.array(pose), covariance[None])
     assert np.array_equal(buffer.lookup("map", "base", 5).covariance, np.eye(6))
