@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.pictures import jpeg, pixels, png, video
 from helpers.processes import until
+from helpers.tokens import current_tokens
 
 from zstate.cameras import Camera, CameraInfoPublisher, CameraListener, CameraPublisher, Picture
 from zstate.clock import ManualClock
@@ -17,6 +18,7 @@ from zstate.errors import Closed, InvalidInput, LibraryMissing, MessageError, Se
 from zstate.net.session import Session
 from zstate.net.streams import KeyPublisher
 from zstate.streams import MEGABYTE
+from zstate.wire.keys import WRITER_TOKEN
 from zstate.wire.native import encoding_of
 
 MS = 1_000_000
@@ -282,6 +284,7 @@ def test_what_is_no_picture_is_not_published(sessions):
 
 def test_a_camera_has_one_writer(sessions):
     with CameraPublisher(sessions[0], "r1", "wrist", camera()):
+        until(lambda: len(current_tokens(sessions[1], WRITER_TOKEN.expression("r1"), 1.0)) == 2)
         with pytest.raises(SecondWriter):
             CameraPublisher(sessions[1], "r1", "wrist")
         with pytest.raises(SecondWriter):
@@ -291,6 +294,7 @@ def test_a_camera_has_one_writer(sessions):
 
 def test_a_publisher_whose_calibration_belongs_to_another_leaves_nothing_open(sessions):
     with CameraInfoPublisher(sessions[0], "r1", "wrist", camera()):
+        until(lambda: current_tokens(sessions[1], WRITER_TOKEN.expression("r1"), 1.0))
         with pytest.raises(SecondWriter):
             CameraPublisher(sessions[1], "r1", "wrist", camera())
         CameraPublisher(sessions[0], "r1", "wrist").close()

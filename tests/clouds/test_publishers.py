@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.processes import repeated, until
+from helpers.tokens import current_tokens
 
 from zstate.clock import ManualClock
 from zstate.clouds import Cloud, CloudListener, CloudPublisher, PlacedCloud
 from zstate.errors import InvalidInput, SecondWriter
+from zstate.wire.keys import WRITER_TOKEN
 
 XYZ = np.array([[1.0, 2.0, 3.0], [np.nan, np.nan, np.nan], [-1.0, 0.5, 0.25]])
 TIMED = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f4")])
@@ -149,8 +151,7 @@ def test_wrong_options_are_refused_at_once(sessions, options: Any, text: str):
 
 
 def test_one_sensor_has_one_writer(sessions):
-    with (
-        CloudPublisher(sessions[0], "r1", "front"),
-        pytest.raises(SecondWriter, match="already writes cloud"),
-    ):
-        CloudPublisher(sessions[1], "r1", "front")
+    with CloudPublisher(sessions[0], "r1", "front"):
+        until(lambda: current_tokens(sessions[1], WRITER_TOKEN.expression("r1"), 1.0))
+        with pytest.raises(SecondWriter, match="already writes cloud"):
+            CloudPublisher(sessions[1], "r1", "front")

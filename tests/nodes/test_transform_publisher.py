@@ -153,6 +153,7 @@ def test_static_edge_is_not_moved_by_another_writer(sessions):
         TransformPublisher(second_session, "r1", "tracker") as tracker,
     ):
         statics.set(pose("tool", "camera"))
+        until(lambda: current_tokens(second_session, "zstate/r1/@writer/$*tf_static$*/*", 1.0))
         with pytest.raises(SecondWriter, match="'mount' of 'r1'"):
             tracker.publish([pose("tool", "camera")])
 

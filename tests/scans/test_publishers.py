@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.processes import Child, until
+from helpers.tokens import current_tokens
 
 from zstate import connect
 from zstate.clock import ManualClock
@@ -17,6 +18,7 @@ from zstate.scans import Grid, MapPublisher, Scan, ScanPublisher
 from zstate.scans.grid import grid_from_message
 from zstate.scans.messages import SCAN_RAYS, LaserScan, OccupancyGrid
 from zstate.scans.scan import scan_from_message
+from zstate.wire.keys import WRITER_TOKEN
 from zstate.wire.registry import get_wire
 
 GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}
@@ -211,6 +213,7 @@ def test_wrong_geometry_is_refused_when_the_publisher_opens(sessions):
 def test_second_writer_of_a_sensor_is_refused_with_the_name_of_the_first(sessions):
     writer, other = sessions
     with ScanPublisher(writer, "r1", "front", program="first", **GEOMETRY):
+        until(lambda: current_tokens(other, WRITER_TOKEN.expression("r1"), 1.0))
         with pytest.raises(SecondWriter, match="first"):
             ScanPublisher(other, "r1", "front", **GEOMETRY)
         with ScanPublisher(other, "r1", "rear", **GEOMETRY):
@@ -306,6 +309,7 @@ def test_large_map_reaches_early_and_late_readers_through_a_router(spawn, free_p
 def test_second_writer_of_a_map_is_refused(sessions):
     writer, other = sessions
     with MapPublisher(writer, "hall", ROOM, program="first"):
+        until(lambda: current_tokens(other, WRITER_TOKEN.expression("hall"), 1.0))
         with pytest.raises(SecondWriter, match="first"):
             MapPublisher(other, "hall", ROOM)
         with MapPublisher(other, "hall", ROOM, writer="cellar"):
