@@ -158,6 +158,7 @@ def test_fixes_place_the_odometry_in_the_map_and_the_pose_there_has_a_covariance
             until(is_in_map)
             rover.truth.drive((0.0, 0.0))
         at_rest = time.time_ns() + 1_000_000_000  # 20 time constants of the wheels
+        listener.buffer.wait("r1/map", BASE, timeout_s=DEADLINE_S)  # the pose is a stream of its own
         until(lambda: listener.buffer.latest("r1/map", BASE) >= at_rest)
         map_from_base, pose = listener.buffer.lookup("r1/map", BASE), received[-1]
         x, y, yaw = rover.truth.pose
