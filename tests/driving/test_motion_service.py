@@ -394,6 +394,11 @@ def test_a_request_of_a_program_that_is_not_announced_as_a_commander_is_not_plan
         assert set(host.report().refused) == {"no claim"}
 
 
+def has_joints(replies: list[MotionReply]) -> bool:
+    """Whether a driver has answered whose joints are known: it answers before it has two readings."""
+    return any("its joints are not known" not in " ".join(reply.findings) for reply in replies)
+
+
 def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
     with hosted(sessions[0], Written()), announced(sessions[1]):
         for count, text in (
@@ -406,7 +411,7 @@ def test_a_request_for_more_than_the_joints_of_the_driver_is_refused(sessions):
 
             def is_answered(request=request, found=found) -> bool:
                 found[:] = replies_to(sessions[1], "zstate/arm/@motion", request)
-                return bool(found)
+                return has_joints(found)
 
             until(is_answered)
             assert text in found[0].findings[0]
@@ -422,7 +427,7 @@ def test_a_motion_has_10000_points_with_velocities_and_accelerations_of_all_join
 
         def is_answered() -> bool:
             found[:] = replies_to(sessions[1], "zstate/arm/@motion", request)
-            return bool(found)
+            return has_joints(found)
 
         until(is_answered)
         assert found[0].findings == ()
