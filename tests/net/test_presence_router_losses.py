@@ -53,6 +53,21 @@ def test_leaving_writer_is_distinguished_from_a_lost_router(spawn, free_port):
     assert changes[-2:] == ["cut off", "gone"]
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_losses_are_reported_though_the_call_before_them_fails(sessions):
+    ours, theirs = sessions
+    changes: list[bool] = []
+
+    def fail() -> None:
+        raise OSError("no events")
+
+    with WriterWatch(ours, "*", lambda _, alive: changes.append(alive), before_losses=fail) as watch:
+        with announce(theirs, TOKEN):
+            until(lambda: changes == [True])
+        until(lambda: changes == [True, False])
+        until(lambda: watch.failures == 1)
+
+
 def test_peers_lose_no_router(sessions):
     ours, theirs = sessions
     with RouterLossDetector(ours) as losses:

@@ -143,9 +143,11 @@ class WriterWatch(Receiver):
                 return
             changes = [(token, False) for token in known - current]
             changes += [(token, True) for token in current - known]
-        if not all(alive for _, alive in changes):
-            self._before_losses()
-        call_for_each(changes, lambda change: self._on_change(*change))
+        try:
+            if not all(alive for _, alive in changes):
+                self._before_losses()
+        finally:
+            call_for_each(changes, lambda change: self._on_change(*change))
 
     def _current_tokens(self) -> set[str]:
         """All tokens, queried until the replies are complete: a token that a reply lacks may be alive."""
