@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import zenoh
 
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
@@ -234,8 +235,8 @@ class Session(Closeable):
         """False once this session is closed, and in a forked process."""
         self._lock = fork_safe_lock()
         self._numbers = itertools.count()
-        self._nodes: dict[tuple[str, str], int] = {}
-        self._written_nodes: set[tuple[str, str]] = set()
+        self._nodes: BoundedDict[tuple[str, str], tuple[int, bool]] = BoundedDict()
+        """The number of a node by robot and program, and whether it has a writer."""
         self._ended_queryables: set[str] = set()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
@@ -266,13 +267,11 @@ class Session(Closeable):
         """
         node = (robot, program)
         with self._lock:
-            if is_writer and node in self._written_nodes:
+            number, has_writer = self._nodes.get(node) or (self.next_number(), False)
+            if is_writer and has_writer:
                 return self.next_number()
-            if is_writer:
-                self._written_nodes.add(node)
-            if node not in self._nodes:
-                self._nodes[node] = self.next_number()
-            return self._nodes[node]
+            self._nodes[node] = number, has_writer or is_writer
+            return number
 
     # zenoh 1.10, a queryable stays in the routes while another session has an equal one: delete when fixed
     # (eclipse-zenoh/zenoh pull request 2660 mends that between routers, not for clients and peers)
