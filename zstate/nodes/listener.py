@@ -43,9 +43,9 @@ class TransformListener(Closeable):
       seconds before (their ``cache_s``).
     - ``on_event``: is called, with a ``WriterEvent``, on a thread of its own when a writer joins, leaves, is
       restarted, is cut off or comes back, falls silent, or conflicts with another one.
-    - ``placers``: the robots whose writers may place the roots of others, in their frames, and any frame with
-      the name of another robot, known or not; None: every robot.
-      A frame ``robot/...`` is placed by that robot's own writers.
+    - ``placers``: the robots whose writers may place the roots of others, in their frames; None: every robot.
+      A frame ``robot/...`` is placed by that robot's own writers; if ``placers`` are given, also while no
+      such robot is known.
 
     Raises InvalidInput if a sequence of robots is empty, or contains ``"*"``, an invalid name or a name
     twice; on the ROS wires if it has more than one name.

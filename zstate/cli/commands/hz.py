@@ -93,10 +93,9 @@ def hz_command(
         while time.monotonic() < end:
             count, facts = _read_for(1.0, reader, statistics), statistics.facts()
             if facts is not None and (count or once):
-                has_gaps, newest = facts["missed"] > 0, statistics.window()
-                by_site = (
-                    thinning if has_gaps and thinning is not None and thinning.explains(newest) else None
-                )
+                newest = statistics.window()
+                is_thinned = facts["missed"] and thinning is not None and thinning.explains(newest)
+                by_site = thinning if is_thinned else None
                 if as_json:
                     print_json({**facts, "thinned_by": None if by_site is None else by_site.site})
                 else:

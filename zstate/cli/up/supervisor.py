@@ -63,7 +63,7 @@ class Supervisor:
                 for process in self._processes.values():
                     is_due = process.child is None and not process.is_over and time.monotonic() >= process.due
                     if is_due and not self._not_ready(process):
-                        with deferred_signals():  # one in between would leave a process that nobody knows
+                        with deferred_signals():  # _end_all ends a process that has started
                             process.child, process.started = self._start(process), time.monotonic()
                         process.is_ready = process.is_ready or process.spec.ready is None
                 failure = self._next_event()
