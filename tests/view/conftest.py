@@ -44,12 +44,22 @@ FLAGS = (
     "--disable-features=SpareRendererForSitePerProcess",  # a process for each tab that is not opened
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1 , EXCLUDE localhost",
 )
-SLOW_FRAMES = """
+FRAMES_ON_REQUEST = """
     const onNextFrame = window.requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = (draw) => setTimeout(() => onNextFrame(draw), 250);
-    window.cancelAnimationFrame = clearTimeout;
+    const waiting = new Map();
+    let last = 0;
+    window.requestAnimationFrame = (draw) => { waiting.set(++last, draw); return last; };
+    window.cancelAnimationFrame = (number) => waiting.delete(number);
+    window.drawFrame = () => new Promise((drawn) => onNextFrame((now) => {
+        const draws = [...waiting.values()];
+        waiting.clear();
+        draws.forEach((draw) => draw(now));
+        drawn();
+    }));
+    setInterval(window.drawFrame, 500);
 """
-"""The page draws in a loop, which would keep the processors busy that other tests wait for."""
+"""The page draws in a loop, which would keep the processors busy that other tests wait for. It draws here
+when a picture is taken of it, and now and then for what it does while it draws."""
 TIMEOUT_MS = 45_000.0
 """A browser without a graphics card, on a busy machine."""
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -70,10 +80,11 @@ class BrowserTab:
         return found
 
     def pixels(self) -> NDArray[np.uint8]:
-        """A screenshot: (H, W, 3)."""
+        """A screenshot: (H, W, 3), of a frame that is drawn now."""
         import numpy as np
         from PIL import Image
 
+        self.tab.evaluate("drawFrame()")
         shot = self.tab.screenshot(timeout=TIMEOUT_MS)
         return np.asarray(Image.open(io.BytesIO(shot)))[:, :, :3]
 
@@ -129,7 +140,7 @@ def open_tab(browser: Browser) -> Iterator[Callable[..., BrowserTab]]:
 
     def opened(url: str, width: int = 800, height: int = 500) -> BrowserTab:
         tab = browser.new_page(viewport={"width": width, "height": height})
-        tab.add_init_script(SLOW_FRAMES)
+        tab.add_init_script(FRAMES_ON_REQUEST)
         view_tab = BrowserTab(tab)
         view_tabs.append(view_tab)
         tab.on("pageerror", lambda error: view_tab.errors.append(str(error)))

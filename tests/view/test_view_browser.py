@@ -129,10 +129,11 @@ def test_robot_meshes_are_drawn_at_the_poses_of_their_links(robot: str, open_tab
             until(lambda: shown.view.scene.visuals == shows)
             return picture(view_tab)
 
-        # The camera is the fitted one once it does not move between two pictures without meshes.
+        # The camera is the fitted one once it does not move between two pictures without meshes. A page shows
+        # a change some time after it was made: then the picture with meshes is another one.
         bare, full, again = toggled(False), toggled(True), toggled(False)
         deadline = time.monotonic() + DEADLINE_S
-        while changed(bare, again).any() and time.monotonic() < deadline:
+        while (changed(bare, again).any() or not changed(full, bare).any()) and time.monotonic() < deadline:
             bare, full, again = again, toggled(True), toggled(False)
         toggled(True)
         view_tab.save_screenshot(f"{robot}")

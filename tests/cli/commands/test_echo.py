@@ -337,7 +337,7 @@ def test_sensor_that_is_not_published_is_explained():
 
 def test_it_ends_after_the_seconds_that_are_given():
     with published_robot():
-        ended = run_cli("echo", "rrbot", "--field", "seq", "--seconds", "0.5")
+        ended = run_cli("echo", "rrbot", "--field", "seq", "--seconds", "2")
     numbers = list(map(int, ended.stdout.splitlines()))
     assert len(numbers) > 1
     assert numbers == sorted(set(numbers))
