@@ -185,6 +185,7 @@ def test_writer_restarted_under_another_name_is_played_without_loss(sessions, re
         TransformListener(sessions[0], "cart", history_s=100.0) as listener,
         Player(sessions[1], restarted, rate=math.inf) as player,
     ):
+        wait_for_stream_readers(sessions[1], "cart", "transforms/odometry", "transforms/camera")
         assert player.run().samples == 3 * COUNT
         stamps = [START + n * 10 * MS for n in range(2 * COUNT)]
         for child in ("base", "ball"):

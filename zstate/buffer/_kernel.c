@@ -37,6 +37,7 @@
 #include "_kernel/motion.h"
 #include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
+#include "_kernel/lanes.h"
 #include "_kernel/path.h"
 #include "_kernel/curve.h"
 #include "_kernel/place.h"

@@ -70,6 +70,24 @@ pose_at(const Path *self, const Bracket *nows)
     return self->to_source == 0 ? target_from_top : compose(target_from_top, source_from_top);
 }
 
+/* pose_at of LANES instants. */
+static void
+poses_at(const Path *self, const Bracket *nows, Py_ssize_t tracks, Poses *poses)
+{
+    Poses source_from_top;
+    if (self->to_target == 0) {
+        chain_lanes(self->steps, self->to_source, nows, tracks, poses);
+        return;
+    }
+    chain_lanes(self->steps, self->to_target, nows, tracks, poses);
+    for (int i = 0; i < LANES; i++)
+        set_lane(poses, i, invert(lane_of(poses, i)));
+    if (self->to_source == 0)
+        return;
+    chain_lanes(self->steps + self->to_target, self->to_source, nows, tracks, &source_from_top);
+    compose_lanes(poses, &source_from_top);
+}
+
 /* The newest instant that all tracks have reached. False if one is empty. */
 static bool
 newest_common(const Path *self, int64_t *at)
@@ -236,7 +254,7 @@ path_failure_at(Path *self, PyObject *stamp)
 
 typedef struct {
     Window *windows;
-    Bracket *nows;
+    Bracket *nows; /* of all tracks, for LANES instants */
     Py_ssize_t tracks;
     int64_t oldest; /* every track covers the instants between these two */
     int64_t newest;
@@ -259,7 +277,7 @@ batch_begin(const Path *self, Batch *batch)
     batch->oldest = INT64_MIN;
     batch->newest = INT64_MAX;
     batch->windows = PyMem_New(Window, (size_t)tracks + 1);
-    batch->nows = PyMem_New(Bracket, (size_t)tracks + 1);
+    batch->nows = PyMem_New(Bracket, LANES * ((size_t)tracks + 1));
     if (batch->windows == NULL || batch->nows == NULL) {
         PyMem_Free(batch->windows);
         PyMem_Free(batch->nows);
@@ -315,24 +333,38 @@ index_from_near(const Window *window, int64_t at)
     return index_not_before(window->block, window->first, near, at);
 }
 
-static bool
-batch_pose(const Path *self, const Batch *batch, int64_t at, Pose *pose)
+/* The rows around an instant in all tracks. False if one of them does not cover it. */
+static inline bool
+batch_rows_around(const Batch *batch, int64_t at, Bracket *nows)
 {
     if (at < batch->oldest || at > batch->newest)
         return false;
     for (Py_ssize_t i = 0; i < batch->tracks; i++) {
         Window *window = &batch->windows[i];
         window->near = index_from_near(window, at);
-        if (!rows_around(window, window->near, at, &batch->nows[i]))
+        if (!rows_around(window, window->near, at, &nows[i]))
             return false;
     }
-    Pose found = pose_at(self, batch->nows);
+    return true;
+}
+
+/* False if a number of the pose is not finite. */
+static inline bool
+batch_finish(const Batch *batch, Pose found, Pose *pose)
+{
     if (batch->tracks != 0)
         found = normalized(found);
     if (!is_finite(found))
         return false;
     *pose = found;
     return true;
+}
+
+static bool
+batch_pose(const Path *self, const Batch *batch, int64_t at, Pose *pose)
+{
+    return batch_rows_around(batch, at, batch->nows) &&
+           batch_finish(batch, pose_at(self, batch->nows), pose);
 }
 
 /* at_with_windows(stamp): a transform, and the windows that it is computed from. */
@@ -376,14 +408,28 @@ path_at_with_windows(Path *self, PyObject *stamp)
 
 static void
 batch_run(const Path *self, const Batch *batch, const int64_t *stamps, Py_ssize_t count,
-          double *out, char *valid)
+          Pose *poses, char *valid)
 {
     const Pose unknown = {Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN};
+    Py_ssize_t tracks = batch->tracks, rows[LANES];
+    int lanes = 0;
+    Poses found;
     for (Py_ssize_t i = 0; i < count; i++) {
-        Pose pose = unknown;
-        valid[i] = batch_pose(self, batch, stamps[i], &pose);
-        memcpy(out + 7 * i, &pose, sizeof(pose));
+        poses[i] = unknown;
+        valid[i] = false;
+        if (!batch_rows_around(batch, stamps[i], batch->nows + lanes * tracks))
+            continue;
+        rows[lanes++] = i;
+        if (lanes < LANES)
+            continue;
+        poses_at(self, batch->nows, tracks, &found);
+        for (int k = 0; k < LANES; k++)
+            valid[rows[k]] = batch_finish(batch, lane_of(&found, k), &poses[rows[k]]);
+        lanes = 0;
     }
+    for (int k = 0; k < lanes; k++)
+        valid[rows[k]] =
+            batch_finish(batch, pose_at(self, batch->nows + k * tracks), &poses[rows[k]]);
 }
 
 static PyObject *

@@ -68,13 +68,20 @@ joint_value(const Step *step, const Bracket *now)
     return step->scale * value + step->shift;
 }
 
+/* Turned by twice the angle of cosine c and sine s. */
+static inline Pose
+turned_pose(const Step *step, double c, double s)
+{
+    const double *a = step->q_cos, *b = step->q_sin;
+    return (Pose){step->t0[0],         step->t0[1],         step->t0[2],        a[0] * c + b[0] * s,
+                  a[1] * c + b[1] * s, a[2] * c + b[2] * s, a[3] * c + b[3] * s};
+}
+
 static inline Pose
 revolute_pose(const Step *step, double angle)
 {
-    const double *a = step->q_cos, *b = step->q_sin;
-    double half = 0.5 * angle, c = cos(half), s = sin(half);
-    return (Pose){step->t0[0],         step->t0[1],         step->t0[2],        a[0] * c + b[0] * s,
-                  a[1] * c + b[1] * s, a[2] * c + b[2] * s, a[3] * c + b[3] * s};
+    double half = 0.5 * angle;
+    return turned_pose(step, cos(half), sin(half));
 }
 
 static inline Pose
