@@ -160,6 +160,25 @@ def test_paths_over_every_type_of_joint_agree(samples, target: str, source: str,
     assert_same_poses(ours[0], theirs[0])
 
 
+@given(
+    st.lists(positions, min_size=1, max_size=4),
+    links,
+    links,
+    st.lists(st.integers(-1, 32).map(lambda n: NOW + n * S // 8), max_size=40),
+)
+def test_instants_beside_each_other_have_the_bits_of_each_alone(
+    samples, target: str, source: str, asked: list[int]
+) -> None:
+    """However many are in one call, in any order, some of them without a pose."""
+    path, _ = both_paths(a_robot(samples)[0], target, source)
+    poses, valid = path.poses(np.array(asked, np.int64))
+    for stamp, pose, is_valid in zip(asked, poses, valid, strict=True):
+        alone = path.at(stamp)
+        assert is_valid == (alone is not None)
+        if alone is not None:
+            assert pose.tobytes() == alone.pose7.tobytes()
+
+
 @given(positions, st.sampled_from(["spin", "bend", "raise"]))
 def test_results_are_bit_identical_where_the_arithmetic_is_the_same(numbers, joint: str) -> None:
     """A single joint's own edge: nothing is multiplied out beforehand."""

@@ -241,7 +241,7 @@ class Archive:
         self, target: str, source: str, instants: Stamps, robot: str
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The poses at ascending ``instants``."""
-        poses, valid = np.full((len(instants), 7), np.nan), np.zeros(len(instants), np.bool_)
+        poses, valid = np.empty((len(instants), 7)), np.zeros(len(instants), np.bool_)
         if not len(instants):
             return poses, valid
         failure: LookupFailed | None = None
@@ -271,6 +271,7 @@ class Archive:
             in_threads(look_up, self._parts(chosen, instants))
         if failure is not None and not is_known:
             raise failure
+        poses[~valid] = np.nan
         return poses, valid
 
     def messages(self, robot: str, stream: str, start: int, end: int) -> Iterator[ArchivedMessage]:
