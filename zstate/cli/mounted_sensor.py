@@ -42,22 +42,30 @@ def mounted_on_robot(
 ) -> tuple[S, str]:
     """What ``mount(buffer, frame, world_frame)`` returns, once its pose is known; and where its world stands.
 
-    ``frames`` are those of the sensor and of the world. What is missing is printed; the command fails after
+    ``frames`` are those of the sensor and of the world. What is missing is printed, such as the model of a
+    robot that describes itself: without it the root of the robot is not known. The command fails after
     ``seconds``.
     """
     messages, waiter = messages_for(wire), ConditionWaiter()
     listener = opened.enter_context(TransformListener(session, robot, wire=wire))
     listener.add_observer(waiter.notify)
     directory = opened.enter_context(RobotDirectory(session, robot, wire, waiter.notify))
-    frame, world_frame = (full_name(messages.robot or robot, name) for name in frames)
+    owner = messages.robot or robot
+    frame, world_frame = (full_name(owner, name) for name in frames)
     source = mount(listener.buffer, frame, world_frame)
+
+    def lacks_model() -> bool:
+        is_described = "robot_description" in directory.streams(robot)
+        return is_described and owner not in listener.buffer.frame_table((owner,)).robots
 
     def reason() -> str:
         if not directory.streams(robot):
             return messages.unknown(robot, directory.robots())
+        if lacks_model():
+            return directory.no_sample_text(robot, "robot_description")
         return messages.translate(str(source.problem()))
 
-    if not waiter.wait_for(lambda: source.problem() is None, seconds, reason):
+    if not waiter.wait_for(lambda: source.problem() is None and not lacks_model(), seconds, reason):
         fail(f"no {words.measurement} in {seconds:g} s: {reason()}")
     shown = messages.translate(source.target)
     print_status(f"simulating a {words.sensor} in {frames[0]}; {words.world} stands in {shown}")

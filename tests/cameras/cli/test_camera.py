@@ -19,10 +19,12 @@ from helpers.cli_runner import (
 from helpers.pictures import jpeg, video_file
 from helpers.processes import DEADLINE_S, repeated, until
 
-from zstate import TransformListener, connect
+from zstate import StaticPublisher, Transform, TransformListener, connect
 from zstate.cameras import Camera, CameraListener, CameraPublisher
 from zstate.cameras.cli.mesh_files import MeshFiles
 from zstate.model.geometry import MeshFile
+from zstate.net.presence import announce, local_writer
+from zstate.wire.keys import WRITER_TOKEN
 
 CALIBRATION = """\
 image_width: {width}
@@ -114,6 +116,16 @@ def test_a_simulated_camera_has_the_calibration_of_a_file_and_waits_for_its_fram
         text = failure("camera", "rrbot", *options, "--seconds", "0.5")
         assert "no picture in 0.5 s" in text
         assert "'rrbot/wrist'" in text
+
+
+def test_a_simulated_camera_waits_for_the_model_of_a_robot_that_describes_itself():
+    """Without it, the link from which another program's static edge hangs would be taken for the root."""
+    token = WRITER_TOKEN.key("rrbot", "robot_description", local_writer(1, "driver").identity)
+    lens = Transform.from_pose7("camera_link", "lens", [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    with connect() as session, StaticPublisher(session, "rrbot") as edges, announce(session, token):
+        edges.set(lens)
+        text = failure("camera", "rrbot", "--simulate", "--frame", "lens", "--seconds", "0.5")
+    assert "'rrbot' is announced with robot_description, but no sample arrives" in text
 
 
 @pytest.mark.parametrize("is_own", [False, True])
