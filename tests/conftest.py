@@ -127,7 +127,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    return 3 * (os.cpu_count() or 1)  # tests wait more than they compute
+    return 4 * (os.cpu_count() or 1)  # tests wait more than they compute
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -225,13 +225,12 @@ def test_on_silence_relax_switches_the_torque_off(sessions):
 
 
 def test_a_second_commander_is_refused_with_the_name_of_the_first(sessions):
-    with (
-        Commander(sessions[0], "arm", program="teleop"),
-        pytest.raises(
+    with Commander(sessions[0], "arm", program="teleop"):
+        until(lambda: confirmed_tokens(sessions[1], WRITER_TOKEN.expression("arm")))
+        with pytest.raises(
             SecondWriter, match=r"'teleop@.*already writes joint_commands.*one commander at a time"
-        ),
-    ):
-        Commander(sessions[1], "arm")
+        ):
+            Commander(sessions[1], "arm")
 
 
 def test_commands_of_another_session_are_refused_while_the_first_are_valid(sessions):

@@ -120,6 +120,7 @@ def test_second_writer_of_an_edge_is_refused_and_the_first_named(sessions):
         StaticPublisher(second_session, "r1", "mount") as statics,
     ):
         first.publish([pose("odom", "base_link")])
+        until(lambda: current_tokens(second_session, "zstate/r1/@edge/**", 1.0))
         for publish in (second.publish, lambda edges: statics.set(edges[0])):
             for parent in ("odom", "map"):
                 with pytest.raises(

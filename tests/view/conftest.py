@@ -38,9 +38,10 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
-    # Half of the time that a processor takes to draw.
+    # Half of the time that a processor takes to draw, and a fifth of that for the whole page.
     "--webgl-antialiasing-mode=none",
     "--webgl-msaa-sample-count=0",
+    "--disable-gpu-compositing",
     "--disable-features=SpareRendererForSitePerProcess",  # a process for each tab that is not opened
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1 , EXCLUDE localhost",
 )
