@@ -54,19 +54,25 @@ def mounted_on_robot(
     frame, world_frame = (full_name(owner, name) for name in frames)
     source = mount(listener.buffer, frame, world_frame)
 
-    def lacks_model() -> bool:
-        is_described = "robot_description" in directory.streams(robot)
-        return is_described and owner not in listener.buffer.frame_table((owner,)).robots
+    is_described = False
+
+    def has_model() -> bool:
+        return not is_described or owner in listener.buffer.frame_table((owner,)).robots
 
     def reason() -> str:
         if not directory.streams(robot):
             return messages.unknown(robot, directory.robots())
-        if lacks_model():
+        if not has_model():
             return directory.no_sample_text(robot, "robot_description")
         return messages.translate(str(source.problem()))
 
-    if not waiter.wait_for(lambda: source.problem() is None and not lacks_model(), seconds, reason):
-        fail(f"no {words.measurement} in {seconds:g} s: {reason()}")
+    def wait() -> None:
+        if not waiter.wait_for(lambda: source.problem() is None and has_model(), seconds, reason):
+            fail(f"no {words.measurement} in {seconds:g} s: {reason()}")
+
+    wait()
+    is_described = "robot_description" in directory.confirmed_streams(robot)
+    wait()
     shown = messages.translate(source.target)
     print_status(f"simulating a {words.sensor} in {frames[0]}; {words.world} stands in {shown}")
     return source, shown

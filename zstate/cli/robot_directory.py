@@ -62,6 +62,7 @@ class RobotDirectory(Closeable):
         from zstate.net.presence import WriterWatch
 
         self.messages = messages_for(wire)
+        self._session, self._wire = session, wire
         announced: set[Announcement] = set()
         self._announced = announced
 
@@ -83,6 +84,18 @@ class RobotDirectory(Closeable):
     def streams(self, robot: str) -> frozenset[StreamName]:
         """The streams of ``robot`` that have a writer."""
         return frozenset(one.stream for one in self._announced.copy() if one.robot == robot)
+
+    def confirmed_streams(self, robot: str) -> frozenset[StreamName]:
+        """The same, as the network answers now: the tokens of writers may still be on the way here.
+
+        Takes a fraction of a second. Raises Unreachable.
+        """
+        from zstate.net.discovery import discover_tokens
+        from zstate.wire.registry import get_wire
+
+        wire = get_wire(self._wire)
+        tokens = discover_tokens(self._session, wire.writers_expression(robot))
+        return frozenset(one.stream for token in tokens for one in wire.parse_token(token, robot))
 
     def no_sample_text(self, robot: str, stream: StreamName, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
