@@ -43,8 +43,8 @@ def mounted_on_robot(
     """What ``mount(buffer, frame, world_frame)`` returns, once its pose is known; and where its world stands.
 
     ``frames`` are those of the sensor and of the world. What is missing is printed, such as the model of a
-    robot that describes itself: without it the root of the robot is not known. The command fails after
-    ``seconds``.
+    robot that describes itself: without it the root of the robot is not known. The command fails if
+    something is missing for ``seconds``.
     """
     messages, waiter = messages_for(wire), ConditionWaiter()
     listener = opened.enter_context(TransformListener(session, robot, wire=wire))

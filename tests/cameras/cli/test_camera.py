@@ -124,7 +124,7 @@ def test_a_simulated_camera_waits_for_the_model_of_a_robot_that_describes_itself
     lens = Transform.from_pose7("camera_link", "lens", [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with connect() as session, StaticPublisher(session, "rrbot") as edges, announce(session, token):
         edges.set(lens)
-        text = failure("camera", "rrbot", "--simulate", "--frame", "lens", "--seconds", "0.5")
+        text = failure("camera", "rrbot", "--simulate", "--frame", "lens", "--seconds", "2")
     assert "'rrbot' is announced with robot_description, but no sample arrives" in text
 
 
