@@ -153,9 +153,13 @@ def test_metadata_describes_several_recordings_as_episodes(run: Path, tmp_path: 
     assert (features[KEY]["dtype"], features[KEY]["shape"]) == ("video", [48, 64, 3])
     with av.open(str(folder / info["video_path"].format(video_key=KEY, chunk_index=0, file_index=1))) as file:
         stream = file.streams.video[0]
-        own = {"codec": stream.codec_context.name, "pix_fmt": stream.pix_fmt, "fps": int(stream.average_rate)}
+        own = {
+            "codec": stream.codec_context.name,
+            "pix_fmt": stream.pix_fmt,
+            "fps": float(stream.average_rate),
+        }
         assert own == {name: features[KEY]["info"][f"video.{name}"] for name in own}
-        assert (stream.frames, float(stream.average_rate)) == (counts[1], float(FPS))
+        assert (stream.frames, own["fps"]) == (counts[1], FPS)
     episodes = parquet.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [one["length"] for one in episodes] == counts
     assert [(one["dataset_from_index"], one["dataset_to_index"]) for one in episodes] == [

@@ -81,7 +81,7 @@ def test_a_password_comes_from_the_environment_or_a_file(
     [
         (("--certs", "."), "--identity NAME"),
         (("--identity", "r1"), "--certs DIR"),
-        (("--password-file", "pyproject.toml"), "--user NAME"),
+        (("--password-file", __file__), "--user NAME"),
     ],
 )
 def test_half_an_identity_is_wrong_usage(options: tuple[str, ...], hint: str):
