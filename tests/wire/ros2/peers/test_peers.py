@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.processes import until
 from helpers.robots import RRBOT, SECOND, STAMP, assert_pose, kinematic_pose
+from helpers.tokens import current_tokens
 from peers import DOMAIN, Peer, repeat_until
 from ros_messages import (
     JOINT_STATE,
@@ -25,7 +26,7 @@ from ros_messages import (
 )
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.net.session import Session
+from zstate.net.session import Session, connect
 from zstate.net.subscription import Received, subscribe
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -56,6 +57,14 @@ every_peer_that_latches = pytest.mark.parametrize("peer", [SDK, KILTED], indirec
 # zenoh-ros2-sdk signs with numbers of its own, not with the hash of its token.
 every_peer_that_signs = pytest.mark.parametrize("peer", [PYZEROS, KILTED], indirect=True)
 pytestmark = pytest.mark.processes
+
+
+def subscribe_late(peer: Peer, router: str, topic: str, type: str) -> None:
+    """Subscribe a latched topic once ``router`` knows its publisher: zenoh-ros2-sdk looks for it once."""
+    token = f"@ros2_lv/{DOMAIN}/*/*/*/MP/*/*/*/%{topic.removeprefix('/')}/**"
+    with connect(mode="client", endpoints=router) as other:
+        until(lambda: current_tokens(other, token, 1.0))
+    peer.subscribe(topic, type, latched=True)
 
 
 def advertise_edges(peer: Peer) -> None:
@@ -109,11 +118,11 @@ def test_peer_receives_the_moving_edges_of_a_robot(peer: Peer, session: Session)
 
 
 @every_peer_that_latches
-def test_late_peer_receives_the_model_and_the_fixed_edges(peer: Peer, session: Session):
+def test_late_peer_receives_the_model_and_the_fixed_edges(peer: Peer, router: str, session: Session):
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)):
-        peer.subscribe("/robot_description", STRING, latched=True)
+        subscribe_late(peer, router, "/robot_description", STRING)
         assert peer.receive("/robot_description") == {"data": RRBOT.urdf}
-        peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
+        subscribe_late(peer, router, "/tf_static", TF_MESSAGE)
         received = peer.receive("/tf_static")
     assert edges_of(received)
     for (parent, child), matrix in edges_of(received).items():
@@ -121,10 +130,10 @@ def test_late_peer_receives_the_model_and_the_fixed_edges(peer: Peer, session: S
 
 
 @every_peer_that_latches
-def test_late_peer_receives_a_static_edge(peer: Peer, session: Session):
+def test_late_peer_receives_a_static_edge(peer: Peer, router: str, session: Session):
     with StaticPublisher(session, "r1", "camera_mount", wires=WIRE) as statics:
         statics.set(Transform.from_pose7("tool", "camera", TURN))
-        peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
+        subscribe_late(peer, router, "/tf_static", TF_MESSAGE)
         assert peer.receive("/tf_static") == tf_message(transform_stamped(0, "tool", "camera", TURN))
 
 
@@ -211,9 +220,9 @@ def test_listener_places_the_scans_of_a_peer(peer: Peer, session: Session):
 
 
 @every_peer_that_latches
-def test_late_peer_receives_the_map(peer: Peer, session: Session):
+def test_late_peer_receives_the_map(peer: Peer, router: str, session: Session):
     with MapPublisher(session, "hall", Grid(CELLS, 0.25, TURN, stamp=STAMP), WIRE):
-        peer.subscribe("/map", OCCUPANCY_GRID, latched=True)
+        subscribe_late(peer, router, "/map", OCCUPANCY_GRID)
         assert peer.receive("/map") == GRID
 
 
