@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.processes import Child, until
 from helpers.tokens import current_tokens
+from numpy.typing import NDArray
 
 from zstate import connect
 from zstate.clock import ManualClock
@@ -23,9 +25,6 @@ from zstate.wire.registry import get_wire
 
 GEOMETRY = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 10.0}
 ROOM = Grid([[0, 100], [-1, 50]], 0.5, (1.0, 2.0, 0.3))
-
-# Deflated it takes 13.5 MB, in CDR 16 MB: sockets and Zenoh's queues hold about 4.
-LARGE_CELLS = np.random.default_rng(1).integers(-1, 101, (4000, 4000), dtype=np.int8)
 
 LARGE_MAP_WITHIN_S = 60.0
 """A busy machine deflates, encodes and routes it in seconds."""
@@ -47,6 +46,12 @@ ROUTE = """
         print("ready")
         sys.stdin.readline()
 """
+
+
+@cache
+def large_cells() -> NDArray[np.int8]:
+    """Deflated they take 13.5 MB, in CDR 16 MB: sockets and Zenoh's queues hold about 4."""
+    return np.random.default_rng(1).integers(-1, 101, (4000, 4000), dtype=np.int8)
 
 
 class Scans(list[Scan]):
@@ -77,7 +82,7 @@ class Maps(dict[str, Grid]):
     def receive_large_one(self) -> None:
         until(lambda: self, LARGE_MAP_WITHIN_S)
         (grid,) = self.values()
-        assert np.array_equal(grid.cells, LARGE_CELLS)
+        assert np.array_equal(grid.cells, large_cells())
 
 
 def publish_until_received(publisher: ScanPublisher, scans: Scans, ranges, **options) -> Scan:
@@ -276,7 +281,7 @@ def receive_late(wire: str, **options: Any) -> None:
 def test_large_map_reaches_early_and_late_readers_in_its_process(sessions, wire: str):
     writer, reader = sessions
     early = Maps(reader, wire)
-    with MapPublisher(writer, "hall", Grid(LARGE_CELLS, 0.05, (0, 0, 0)), wire):
+    with MapPublisher(writer, "hall", Grid(large_cells(), 0.05, (0, 0, 0)), wire):
         early.receive_large_one()
         receive_late(wire)
 

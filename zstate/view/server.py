@@ -51,8 +51,9 @@ _SILENT.propagate = False
 # Held while websockets.asyncio.server.serve is replaced.
 _opening = threading.Lock()
 
-# Chromium-based browsers.
+# Chromium-based browsers, the one that opens no window first: it starts in less time.
 _PROGRAMS = (
+    "chromium-headless-shell",
     "chromium",
     "chromium-browser",
     "google-chrome",
