@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
+from pathlib import Path
 
 import pytest
 
@@ -19,7 +21,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from zstate.errors import InvalidInput
-from zstate.view.server import ViewServer
+from zstate.view.server import ScreenshotFailed, ViewServer, save_screenshot
 
 PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
 
@@ -170,3 +172,32 @@ def test_server_prints_nothing(capsys: pytest.CaptureFixture[str]):
         until(lambda: listens("127.0.0.1", page.port))
     output = capsys.readouterr()
     assert "viser" not in output.out + output.err
+
+
+def test_a_browser_that_a_script_has_started_ends_with_the_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As Debian's chromium-headless-shell, which does not become the browser but starts it."""
+    script, alive, started = tmp_path / "chromium-headless-shell", tmp_path / "alive", tmp_path / "started"
+    script.write_text(
+        f"#!/bin/sh\n(touch {started}; exec sleep 600) >{alive} &\nuntil [ -e {started} ]; do :; done\n"
+    )
+    script.chmod(0o755)
+    os.mkfifo(alive)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    reader = os.open(alive, os.O_RDONLY | os.O_NONBLOCK)
+
+    def has_ended() -> bool:
+        """At the end of the pipe, which only the browser has open."""
+        try:
+            return os.read(reader, 1) == b""
+        except BlockingIOError:
+            return False
+
+    try:
+        with ViewServer(port=0) as page, pytest.raises(ScreenshotFailed, match="did not open the page"):
+            save_screenshot(page, tmp_path / "a.png", width=8, height=8, hold=lambda _: False)
+        assert started.exists()
+        until(has_ended)
+    finally:
+        os.close(reader)

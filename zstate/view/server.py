@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
@@ -283,11 +284,17 @@ def _headless_browser(url: str, width: int, height: int) -> Generator[subprocess
         try:
             yield process
         finally:
-            process.terminate()
+            # All processes of the session: the program may be a script that has started the browser.
+            _signal_group(process, signal.SIGTERM)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(_EXIT_TIMEOUT_S)
-            process.kill()
+            _signal_group(process, signal.SIGKILL)
             process.wait()
+
+
+def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS permits no signal to ended ones
+        os.killpg(process.pid, number)
 
 
 def save_screenshot(
