@@ -26,8 +26,8 @@ from zstate.odometry.health import chi_square_quantile
 
 END_SIGMAS = 3.5
 """Of x and y, and of the yaw: one run of 370 by chance; 50 runs have a larger one in one of seven cases."""
-WIDE_SIGMAS = 4.2
-"""The bound of 50 runs, which one of 80 such sets exceeds by chance."""
+WIDE_SIGMAS = 5.0
+"""The bound of the 50 sets of fifty drives, 2,500 runs: one of 90 such families exceeds it by chance."""
 FAST = 3.0
 """[m/s] No estimate is faster; drives have up to 1 m/s."""
 
@@ -73,16 +73,16 @@ def end_of(
     return errors_of(drive, state)
 
 
-def check(ends: Sequence[Errors], bound: float, *, has_exact_noise: bool) -> None:
+def check(ends: Sequence[Errors], bound: float, *, has_exact_noise: bool, least_of_yaw: float = 0.1) -> None:
     """Ends inside their claims; without vibration their mean NEES is below its band's upper edge, and above a
     floor: drives have less lateral and vertical noise than is stated, and constant errors are bounds."""
     assert max(end.sigmas for end in ends) < bound
     if not has_exact_noise:
         return
     squares = np.mean([end.squares for end in ends], axis=0).tolist()
-    for mean, freedom in zip(squares, (3, 3, 3, 1), strict=True):
+    for mean, freedom, least in zip(squares, (3, 3, 3, 1), (0.1, 0.1, 0.1, least_of_yaw), strict=True):
         high = chi_square_quantile(0.999, freedom * len(ends)) / len(ends)
-        assert 0.1 * freedom < mean < 1.2 * high, squares
+        assert least * freedom < mean < 1.2 * high, squares
 
 
 @pytest.mark.long
@@ -118,4 +118,7 @@ def test_the_end_of_a_drive_is_inside_its_claim(kind: str):
 @pytest.mark.parametrize("kind", KINDS)
 def test_fifty_drives_are_inside_their_claims(kind: str, name: str, rest_s: float):
     ends = [end_of(kind, seed, 90.0, VIBRATIONS[name], rest_s=rest_s) for seed in range(50)]
-    check(ends, WIDE_SIGMAS, has_exact_noise=name == "none")
+    # Without the rate of wheels or legs an even turn looks like rest: the gyro's bias is stated to be known
+    # to 0.01 rad/s, though in these drives, which do rest, it is known ten times as well.
+    least = 0.01 if kind == "velocity" and rest_s else 0.1
+    check(ends, WIDE_SIGMAS, has_exact_noise=name == "none", least_of_yaw=least)
