@@ -52,7 +52,7 @@ _SILENT.propagate = False
 # Held while websockets.asyncio.server.serve is replaced.
 _opening = threading.Lock()
 
-# Chromium-based browsers, the one that opens no window first: it starts in less time.
+# Chromium-based browsers, first the one without windows.
 _PROGRAMS = (
     "chromium-headless-shell",
     "chromium",
