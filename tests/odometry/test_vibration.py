@@ -26,8 +26,8 @@ from zstate.odometry.health import chi_square_quantile
 
 END_SIGMAS = 3.5
 """Of x and y, and of the yaw: one run of 370 by chance; 50 runs have a larger one in one of seven cases."""
-WIDE_SIGMAS = 5.0
-"""The bound of the 50 sets of fifty drives, 2,500 runs: one of 90 such families exceeds it by chance."""
+WIDE_SIGMAS = 4.2
+"""The bound of 50 runs, which one of 80 such sets exceeds by chance."""
 FAST = 3.0
 """[m/s] No estimate is faster; drives have up to 1 m/s."""
 
