@@ -14,7 +14,7 @@ from typing import NamedTuple
 from oracles import ORACLES
 
 DEBIAN_PYTHON = "/usr/bin/python3"
-CHROMIUM = "/usr/bin/chromium"
+CHROMIUM = "/usr/bin/chromium-headless-shell"
 
 
 class Requirement(NamedTuple):
@@ -55,7 +55,7 @@ def has_oracle(name: str) -> bool:
 REQUIREMENTS = {
     "browser": Requirement(
         lambda: Path(CHROMIUM).exists() and importlib.util.find_spec("playwright") is not None,
-        "apt-get install chromium fonts-dejavu-core",
+        "apt-get install chromium-headless-shell fonts-dejavu-core",
     ),
     "shells": Requirement(lambda: has_programs("zsh", "fish"), "apt-get install zsh fish"),
     "netns": Requirement(
