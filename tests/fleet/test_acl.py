@@ -16,7 +16,7 @@ from helpers.access_routers import (
     replies,
     router_with_users,
 )
-from helpers.processes import find_free_port, repeated, until
+from helpers.processes import DEADLINE_S, find_free_port, repeated, until
 from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
@@ -151,7 +151,7 @@ def test_late_viewer_receives_all_streams(site: Site):
         assert {stream for stream, _ in info.writers} == set(STREAMS)
         with TransformListener(viewer, "*") as model, TransformListener(viewer, "r1", follow="tf") as poses:
             for listener in (model, poses):
-                assert listener.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
+                assert listener.buffer.wait("base", "camera", timeout_s=DEADLINE_S).kind == "static"
                 until(lambda reader=listener: publish_and_check(publisher, reader))
 
 
@@ -192,7 +192,7 @@ def test_late_viewer_receives_the_transforms_of_a_robot_and_one_writer_owns_an_e
     ):
         odometry.publish(edge)
         with TransformListener(site.join("desk"), "*") as late:
-            assert late.buffer.wait("odom", "world", timeout_s=5.0).translation[0] == 1.0
+            assert late.buffer.wait("odom", "world", timeout_s=DEADLINE_S).translation[0] == 1.0
         with pytest.raises(SecondWriter) as raised:
             lidar.publish(edge)
         assert raised.value.edge == ("r1/odom", "r1/world")
@@ -212,7 +212,7 @@ def test_late_viewer_receives_the_parts_of_a_robot_and_one_driver_owns_a_joint(s
         arm.publish([0.25], stamp=stamp)
         hand.publish([0.5], stamp=stamp)
         with TransformListener(site.join("desk"), "*") as late:
-            late.buffer.wait("world", RRBOT.links[-1], timeout_s=5.0)
+            late.buffer.wait("world", RRBOT.links[-1], timeout_s=DEADLINE_S)
             assert late.buffer.joint_states("r1").positions[-1].tolist() == [0.25, 0.5]
         with pytest.raises(SecondWriter, match=r"hand\.py"):
             PartialStatePublisher(site.join("r1"), RRBOT, joints[1:], "r1")
@@ -301,7 +301,7 @@ def test_robot_discovers_others_and_their_static_edges(site: Site):
         TransformListener(site.join("r2"), "r1", follow="tf") as listener,
     ):
         assert [info.name for info in discover(site.join("r2"))] == ["r1"]
-        assert listener.buffer.wait("world", "base", timeout_s=5.0).kind == "static"
+        assert listener.buffer.wait("world", "base", timeout_s=DEADLINE_S).kind == "static"
 
 
 def test_named_placer_places_robot_roots_and_robots_only_their_own(site: Site):
@@ -322,7 +322,7 @@ def test_named_placer_places_robot_roots_and_robots_only_their_own(site: Site):
             mount.set(Transform("base", "camera", (2.0, 0.0, 0.0), UPRIGHT))
             for reader in (listener, poses):
                 until(lambda reader=reader: publish_and_check(publisher, reader))
-                reader.buffer.wait("site/map", "r1/camera", timeout_s=5.0)
+                reader.buffer.wait("site/map", "r1/camera", timeout_s=DEADLINE_S)
                 assert {frame.writer for frame in reader.buffer.frames(("r1/camera",))} == {"mount"}
                 assert "not among the placers ('site')" in reader.refusals["foreign frame"]
 

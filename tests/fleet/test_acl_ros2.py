@@ -10,7 +10,7 @@ import pytest
 import zenoh
 from helpers import access_routers
 from helpers.access_routers import assert_only_allowed_writes_arrive, publish_and_check, replies
-from helpers.processes import Child, until
+from helpers.processes import DEADLINE_S, Child, until
 from helpers.robots import RRBOT, UPRIGHT
 from helpers.tokens import current_tokens
 
@@ -123,7 +123,7 @@ def test_late_viewer_receives_all_streams_of_a_robot(join: Join):
         viewer = join("desk")
         assert [info.name for info in discover(viewer, wire=WIRE) if info.name == "r1"] == ["r1"]
         with TransformListener(viewer, "r1", wire=WIRE) as listener:
-            listener.buffer.wait("base", "camera", timeout_s=5.0)
+            listener.buffer.wait("base", "camera", timeout_s=DEADLINE_S)
             until(lambda: publish_and_check(publisher, listener))
 
 

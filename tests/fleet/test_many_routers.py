@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from helpers.processes import Child, find_free_port, until
+from helpers.processes import DEADLINE_S, Child, find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
@@ -94,8 +94,8 @@ def test_robot_router_and_fleet_router_forward_both_ways(spawn: Spawn):
         ):
             places.set(Transform("map", "dock", (1.0, 2.0, 0.0), UPRIGHT))
             until(lambda: publish_and_check(publisher, above))
-            assert above.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
-            assert below.buffer.wait("map", "dock", timeout_s=5.0).kind == "static"
+            assert above.buffer.wait("base", "camera", timeout_s=DEADLINE_S).kind == "static"
+            assert below.buffer.wait("map", "dock", timeout_s=DEADLINE_S).kind == "static"
             for session in (hall, robot):
                 until(lambda there=session: [info.name for info in discover(there)] == ["fleet", "r1"])
 

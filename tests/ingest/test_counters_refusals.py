@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.net.latched import LatchedPublisher
@@ -66,7 +66,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_logged_once(sessions, cap
         assert listener.stats.refused == expected
         assert [record.getMessage().count("refused") for record in caplog.records] == [1] * 4
         publisher.publish([0.5, 0.25], stamp=STAMP)
-        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
         assert listener.stats.refused == expected
 
@@ -83,7 +83,7 @@ def test_message_with_invalid_positions_is_counted_and_the_next_is_inserted(sess
         until(lambda: driver.has_readers)
         driver.put(encode(JointState(1, 0, 9, order, to_block(positions))))
         driver.put(encode(JointState(2, 1, 9, order, to_block([0.5, 0.25]))))
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert listener.buffer.latest("world", "tool") == 2
         assert listener.stats.refused == {"bad numbers": 1}
 
@@ -97,4 +97,4 @@ def test_unusable_description_is_counted_and_a_good_one_is_used(sessions):
             latched.set(bad)
             until(lambda: listener.stats.refused == {"robot description": 1})
         with StatePublisher(writer, RRBOT, "r1"):
-            assert listener.buffer.wait("lower", "tool", timeout_s=5.0).translation[2] == 0.6
+            assert listener.buffer.wait("lower", "tool", timeout_s=DEADLINE_S).translation[2] == 0.6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.errors import InFuture
@@ -32,7 +32,7 @@ def test_frames_and_errors_name_the_writer(sessions, monkeypatch):
     with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
         wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0], stamp=STAMP)
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         until(lambda: any("arm_driver@" in (frame.writer or "") for frame in listener.buffer.frames()))
         with pytest.raises(InFuture, match=r"writer arm_driver@\S+ pid \d+") as caught:
             listener.buffer.lookup("world", "tool", STAMP + 1)
@@ -45,7 +45,7 @@ def test_changed_urdf_replaces_the_robot(sessions):
         with StatePublisher(writer, RRBOT, "r1") as publisher:
             wait_for_stream_readers(writer, "r1")
             publisher.publish([0.5, 0.0], stamp=STAMP)
-            listener.buffer.wait("world", "tool", timeout_s=5.0)
+            listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         with StatePublisher(writer, LONGER, "r1") as publisher:
             # Between the old model and the new one the frames have no parents.
             buffer = listener.buffer
@@ -66,7 +66,7 @@ def test_model_places_its_links_and_another_writer_yields(sessions, caplog):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener, StaticPublisher(writer, "r1", "mistake") as statics:
         statics.set(Transform("base", "upper", (9.0, 0.0, 0.0), UPRIGHT))
-        listener.buffer.wait("base", "upper", timeout_s=5.0)
+        listener.buffer.wait("base", "upper", timeout_s=DEADLINE_S)
         with caplog.at_level(logging.WARNING), StatePublisher(writer, RRBOT, "r1") as publisher:
             wait_for_stream_readers(writer, "r1")
             publisher.publish([0.5, 0.25], stamp=STAMP)
@@ -90,7 +90,7 @@ def test_writer_without_a_model_is_mapped_by_its_joint_names(sessions):
     ):
         until(lambda: driver.has_readers)
         driver.put(encode(state))
-        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [1.0, 2.0], "world", "tool"))
 
 
@@ -146,5 +146,5 @@ def test_newer_of_two_writers_is_used_and_the_other_counted(sessions, caplog):
             assert not listener.buffer.can_lookup("world", "tool", 1)
         # The newer one has left: the first is taken again.
         until(lambda: first.publish([1.0, 1.0], stamp=20) or listener.stats.received > 6)
-        assert listener.buffer.wait("world", "tool", 20, timeout_s=5.0)
+        assert listener.buffer.wait("world", "tool", 20, timeout_s=DEADLINE_S)
     assert caplog.text.count("second writer") == 1

@@ -6,7 +6,7 @@ import time
 
 import pytest
 import zenoh
-from helpers.processes import find_free_port, until
+from helpers.processes import DEADLINE_S, find_free_port, until
 from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
 from zstate.buffer.buffer import feed_of
@@ -131,7 +131,7 @@ def test_failed_lookup_mentions_a_wrong_writer_clock(sessions):
     ):
         wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0])
-        stamp = listener.buffer.wait("world", "tool", timeout_s=5.0).stamp
+        stamp = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S).stamp
 
         def refusal(at: int):
             return listener.buffer.explain("world", "tool", at)
@@ -161,7 +161,7 @@ def test_failed_lookup_does_not_mention_a_correct_clock(sessions, follow):
     ):
         wait_for_stream_readers(writer, "r1", follow)
         publisher.publish([0.0, 0.0])
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
 
         def refusal():
             publisher.publish([0.0, 0.0])  # until one of them comes after its writer was announced

@@ -11,7 +11,7 @@ from threading import Barrier
 from typing import Any
 
 import pytest
-from helpers.processes import Child, until
+from helpers.processes import DEADLINE_S, Child, until
 from helpers.robots import RRBOT
 from helpers.tokens import current_tokens
 
@@ -90,7 +90,7 @@ def test_one_of_two_simultaneous_static_writers_of_a_frame_gets_second_writer(pa
             place, error = only_error(errors)
             assert error.first.program == ("room", "mount")[place]
             assert error.edge == ("fleet/base", "fleet/camera")
-            listener.buffer.wait("fleet/base", "fleet/camera", timeout_s=5.0)
+            listener.buffer.wait("fleet/base", "fleet/camera", timeout_s=DEADLINE_S)
             assert listener.buffer.lookup("fleet/base", "fleet/camera").translation[0] == (2.0, 1.0)[place]
 
 

@@ -51,7 +51,7 @@ def test_both_follow_modes_agree_with_kinematics_at_every_stamp(sessions, model)
             publisher.publish(sine.read(stamp).positions, stamp=stamp)
         for listener in (joints, transforms):
             for link in model.links:
-                listener.buffer.wait(model.root, link, timeout_s=5.0)
+                listener.buffer.wait(model.root, link, timeout_s=DEADLINE_S)
             until(lambda listener=listener: listener.stats.received == 20)
     for stamp in stamps:
         for link in model.links:
@@ -68,7 +68,7 @@ def test_late_listener_has_model_and_statics_before_any_sample(sessions, follow)
     with StatePublisher(writer, RRBOT, "r1"), StaticPublisher(writer, "r1", "mount") as statics:
         statics.set(Transform("tool", "hook", (0.0, 0.0, 0.25), UPRIGHT))
         with TransformListener(reader, "r1", follow=follow) as listener:
-            camera = listener.buffer.wait("hook", "camera_link", timeout_s=5.0)
+            camera = listener.buffer.wait("hook", "camera_link", timeout_s=DEADLINE_S)
             expected = kinematic_pose(RRBOT, [0.0, 0.0], "tool", "camera_link")
             expected[2, 3] -= 0.25
             assert_pose(camera, expected)
@@ -81,7 +81,7 @@ def test_frames_are_found_by_bare_and_full_names(sessions):
     with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
         wait_for_stream_readers(writer, "r1")
         publisher.publish([0.5, 0.25], stamp=STAMP)
-        bare = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        bare = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         for target, source in (("r1/world", "r1/tool"), ("world", "r1/tool")):
             assert_pose(listener.buffer.lookup(target, source), bare.matrix)
         assert {frame.name for frame in listener.buffer.frames()} == {f"r1/{link}" for link in RRBOT.links}
@@ -100,7 +100,7 @@ def test_bare_names_of_two_robots_of_one_model_are_ambiguous(sessions, follow):
         first.publish([0.5, 0.25], stamp=STAMP)
         second.publish([-1.0, 2.0], stamp=STAMP + 1)
         for robot, positions in (("r1", [0.5, 0.25]), ("r2", [-1.0, 2.0])):
-            pose = listener.buffer.wait(f"{robot}/world", f"{robot}/tool", timeout_s=5.0)
+            pose = listener.buffer.wait(f"{robot}/world", f"{robot}/tool", timeout_s=DEADLINE_S)
             assert_pose(pose, kinematic_pose(RRBOT, positions, "world", "tool"))
         with pytest.raises(AmbiguousFrame) as caught:
             listener.buffer.lookup("world", "tool")
@@ -118,7 +118,7 @@ def test_listener_of_one_robot_receives_nothing_of_another(sessions):
         wait_for_stream_readers(writer, "r1")
         other.publish([0.0, 0.0])
         mine.publish([0.0, 0.0])
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert listener.robots() == ("r1",)
         assert all(frame.name.startswith("r1/") for frame in listener.buffer.frames())
 
@@ -205,7 +205,7 @@ def test_two_listeners_fill_one_given_buffer(sessions):
         TransformListener(reader, "r2", buffer, follow="tf") as other,
     ):
         assert one.buffer is other.buffer is buffer
-        palm_from_base = buffer.wait("base", "palm", timeout_s=5.0)
+        palm_from_base = buffer.wait("base", "palm", timeout_s=DEADLINE_S)
         # mount_to_palm is 0.01 above; base is at world.
         assert np.allclose(palm_from_base.translation, [-1.0, 2.0, 0.01], rtol=0, atol=1e-12)
 
@@ -243,7 +243,7 @@ def test_close_ends_reception_and_may_be_repeated(sessions):
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0], stamp=STAMP)
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         listener.close()
         listener.close()
         with KeyPublisher(writer, "zstate/r1/joint_states", "") as probe:
@@ -356,7 +356,7 @@ def test_invalid_token_hides_no_other(sessions, robot):
         TransformListener(reader, robot) as listener,
     ):
         publisher.publish([0.0, 0.0])
-        listener.buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        listener.buffer.wait("r1/world", "r1/tool", timeout_s=DEADLINE_S)
         until(lambda: len([event for event in listener.events() if event.kind == "joined"]) == 3)
         assert [info.name for info in discover(reader)] == ["r1"]
         assert measure_offsets(reader, "*")

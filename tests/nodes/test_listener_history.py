@@ -390,5 +390,5 @@ def test_history_of_another_session_is_refused(sessions):
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: listener.stats.refused == {"foreign answer": 1})
-        listener.buffer.wait("lower", "tool", timeout_s=5.0)
+        listener.buffer.wait("lower", "tool", timeout_s=DEADLINE_S)
         assert not listener.buffer.can_lookup("world", "tool")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from helpers.manual_cdr import rosbags_joint_state, rosbags_tf_message
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.raw_ros_nodes import (
     DESCRIPTION,
     HUMBLE,
@@ -76,7 +76,7 @@ def test_writers_are_named_by_their_nodes_even_if_announced_late(sessions):
         moving, fixed = node.publisher(TF).wait_for_reader(), node.publisher(TF_STATIC)
         moving.edge(STAMP, "base", "tool", 1.0)
         fixed.edge(0, "tool", "camera", 2.0)
-        listener.buffer.wait("base", "camera", timeout_s=5.0)
+        listener.buffer.wait("base", "camera", timeout_s=DEADLINE_S)
         assert set(writers(listener).values()) != {"/fleet/r1/arm"}
         moving.announce()
         fixed.announce()
@@ -96,7 +96,7 @@ def test_writers_of_every_distribution_are_received(sessions, written: str):
         described.text(RRBOT.urdf)
         driver = RosNode(writer, "driver").publisher(JOINT_STATES, written).announce().wait_for_reader()
         driver.joints(STAMP, NAMES, [0.5, 0.25])
-        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
         until(lambda: writers(listener)["lower"] == "/driver")
 
@@ -108,7 +108,7 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
         publish_description(writer)
         driver = publish_known_joints(writer, listener)
         driver.joints(STAMP, ("lid", "elbow", "shoulder"), [7.0, 0.25, 0.5], [0.0, 2.0, 1.0], [nan] * 3)
-        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
         driver.joints(STAMP + SECOND // 100, ("elbow", "shoulder"), [0.27, 0.51], [2.0, 1.0])
         until(lambda: listener.stats.received == 2)
@@ -131,7 +131,7 @@ def test_nodes_that_publish_some_joints_each_move_one_robot(sessions):
         lower.joints(STAMP + 100, ("shoulder",), [1.0])
         upper.joints(STAMP + 20, ("elbow", "lid"), [2.0, 7.0])
         upper.joints(STAMP + 60, ("elbow", "lid"), [0.0, 7.0])
-        pose = listener.buffer.wait("world", "tool", STAMP + 30, timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", STAMP + 30, timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [0.3, 1.5], "world", "tool"))
         until(lambda: (writers(listener)["upper"], writers(listener)["lower"]) == ("/arm", "/gripper"))
         with pytest.raises(InFuture, match="/gripper"):
@@ -297,7 +297,7 @@ def test_other_edges_of_tf_are_received_beside_joint_states(sessions):
         amcl.edge(STAMP, "map", "odom", 30.0)
         tags.edge(STAMP, "tool", "tag_5", 0.5)
         until(lambda: x_of(listener, "tool", "tag_5", STAMP) == 0.5)
-        found = listener.buffer.wait("map", "tool", STAMP, timeout_s=5.0)
+        found = listener.buffer.wait("map", "tool", STAMP, timeout_s=DEADLINE_S)
         in_world = listener.buffer.lookup("world", "tool", STAMP)
         assert_pose(in_world, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
         assert found.translation - in_world.translation == pytest.approx([32.0, 0.0, 0.0])
@@ -378,7 +378,7 @@ def test_namespace_and_root_are_subscribed_separately(sessions):
         described.text(RRBOT.urdf)
         driver = node.publisher(JOINT_STATES, namespace="r1").announce().wait_for_reader()
         driver.joints(STAMP, NAMES, [0.5, 0.25])
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert root.robots() == ()
 
 
@@ -391,7 +391,9 @@ def test_all_robots_in_namespaces_are_followed(sessions):
             wait_for_reader(writer, f"0/{publisher.robot}/joint_states/{JOINT_STATES[1]}/{JOINT_STATES[2]}")
             publisher.publish([0.1, 0.5 + number], stamp=STAMP)
         for number, publisher in enumerate(publishers):
-            pose = listener.buffer.wait(f"{publisher.robot}/upper", f"{publisher.robot}/lower", timeout_s=5.0)
+            pose = listener.buffer.wait(
+                f"{publisher.robot}/upper", f"{publisher.robot}/lower", timeout_s=DEADLINE_S
+            )
             expected = kinematic_pose(RRBOT, [0.1, 0.5 + number], "upper", "lower")
             assert_pose(pose, expected)
             publisher.close()

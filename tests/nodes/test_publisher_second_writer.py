@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 
 import pytest
-from helpers.processes import find_free_port, until
+from helpers.processes import DEADLINE_S, find_free_port, until
 from helpers.robots import RRBOT
 from helpers.tokens import current_tokens
 from msgspec.structs import replace
@@ -226,7 +226,7 @@ def test_edge_of_another_static_writer_is_refused_and_not_published(sessions):
         TransformListener(sessions[1], "*") as listener,
     ):
         mount.set(edge("camera"))
-        listener.buffer.wait("r1/base", "r1/camera", timeout_s=5.0)
+        listener.buffer.wait("r1/base", "r1/camera", timeout_s=DEADLINE_S)
         with pytest.raises(SecondWriter) as raised:
             room.set(Transform("r2/base", "r1/camera", [2, 0, 0], [0, 0, 0, 1]))
         assert raised.value.first.program == "calibration"
@@ -238,7 +238,7 @@ def test_edge_of_another_static_writer_is_refused_and_not_published(sessions):
         mount.withdraw("camera")
         until(lambda: not listener.buffer.can_lookup("r1/base", "r1/camera"))
         room.set(Transform("r2/base", "r1/camera", [2, 0, 0], [0, 0, 0, 1]))
-        listener.buffer.wait("r2/base", "r1/camera", timeout_s=5.0)
+        listener.buffer.wait("r2/base", "r1/camera", timeout_s=DEADLINE_S)
 
 
 def test_takeover_of_an_edge_is_reported_to_listeners(sessions):
@@ -248,12 +248,12 @@ def test_takeover_of_an_edge_is_reported_to_listeners(sessions):
         StaticPublisher(sessions[0], "r1", "room", takeover=True) as room,
     ):
         mount.set(edge("camera"))
-        listener.buffer.wait("base", "camera", timeout_s=5.0)
+        listener.buffer.wait("base", "camera", timeout_s=DEADLINE_S)
         for _ in range(20):
             room.set(edge("camera"))
         until(lambda: [event.kind for event in listener.events()].count("conflict") == 1)
         room.set(edge("laser"))
-        listener.buffer.wait("base", "laser", timeout_s=5.0)
+        listener.buffer.wait("base", "laser", timeout_s=DEADLINE_S)
         assert [event.kind for event in listener.events()].count("conflict") == 1
 
 

@@ -1,7 +1,7 @@
 import sys
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
@@ -35,9 +35,9 @@ def test_late_listener_gets_all_edges_of_all_writers(sessions):
         mount.set(edge("tool", "camera", 1.0))
         mount.set(edge("camera", "lens", 2.0))
         room.set(edge("map", "tool", 4.0))
-        assert early.buffer.wait("map", "lens", timeout_s=5.0).translation[0] == 7.0
+        assert early.buffer.wait("map", "lens", timeout_s=DEADLINE_S).translation[0] == 7.0
         with TransformListener(reader, "r1") as late:
-            assert late.buffer.wait("map", "lens", timeout_s=5.0).translation[0] == 7.0
+            assert late.buffer.wait("map", "lens", timeout_s=DEADLINE_S).translation[0] == 7.0
             writers = {frame.name: frame.writer for frame in late.buffer.frames() if frame.parent}
     assert writers == {"r1/camera": "mount", "r1/lens": "mount", "r1/tool": "room"}
 
@@ -51,7 +51,7 @@ def test_edges_are_published_on_several_wires_at_once(sessions):
     ):
         statics.set(edge("tool", "camera", 1.0))
         for listener in (here, there):
-            assert listener.buffer.wait("tool", "camera", timeout_s=5.0).translation[0] == 1.0
+            assert listener.buffer.wait("tool", "camera", timeout_s=DEADLINE_S).translation[0] == 1.0
 
 
 def test_update_reaches_every_listener_and_keeps_the_other_edges(sessions):
@@ -64,7 +64,7 @@ def test_update_reaches_every_listener_and_keeps_the_other_edges(sessions):
         statics.set(edge("tool", "camera", 1.0))
         statics.set(edge("tool", "laser", 5.0))
         for listener in (one, other):
-            listener.buffer.wait("tool", "laser", timeout_s=5.0)
+            listener.buffer.wait("tool", "laser", timeout_s=DEADLINE_S)
         statics.set(edge("tool", "camera", 2.0))
         for listener in (one, other):
             until(lambda listener=listener: x_of(listener.buffer, "tool", "camera") == 2.0)
@@ -78,7 +78,7 @@ def test_withdraw_removes_one_edge_and_close_the_rest(sessions):
         with StaticPublisher(writer, "r1", "mount") as statics:
             statics.set(edge("tool", "camera", 1.0))
             statics.set(edge("tool", "laser", 5.0))
-            buffer.wait("tool", "laser", timeout_s=5.0)
+            buffer.wait("tool", "laser", timeout_s=DEADLINE_S)
             statics.withdraw("camera")
             until(lambda: x_of(buffer, "tool", "camera") is None)
             assert x_of(buffer, "tool", "laser") == 5.0
@@ -91,7 +91,7 @@ def test_closing_one_writer_leaves_the_other_ones_edges(sessions):
         with StaticPublisher(writer, "r1", "mount") as mount:
             mount.set(edge("tool", "camera", 1.0))
             room.set(edge("map", "tool", 4.0))
-            listener.buffer.wait("map", "camera", timeout_s=5.0)
+            listener.buffer.wait("map", "camera", timeout_s=DEADLINE_S)
         until(lambda: x_of(listener.buffer, "tool", "camera") is None)
         assert x_of(listener.buffer, "map", "tool") == 4.0
 
@@ -105,7 +105,7 @@ def test_edge_taken_over_by_another_writer_stays_when_the_first_one_closes(sessi
         with StaticPublisher(writer, "r1", "old") as old:
             old.set(edge("tool", "camera", 1.0))
             old.set(edge("tool", "laser", 1.0))
-            listener.buffer.wait("tool", "laser", timeout_s=5.0)
+            listener.buffer.wait("tool", "laser", timeout_s=DEADLINE_S)
             new.set(edge("tool", "camera", 2.0))
             until(lambda: x_of(listener.buffer, "tool", "camera") == 2.0)
         until(lambda: x_of(listener.buffer, "tool", "laser") is None)
@@ -116,13 +116,13 @@ def test_child_can_be_reparented_only_after_it_was_withdrawn(sessions):
     writer, reader = sessions
     with StaticPublisher(writer, "r1", "mount") as statics, TransformListener(reader, "r1") as listener:
         statics.set(edge("tool", "camera", 1.0))
-        listener.buffer.wait("tool", "camera", timeout_s=5.0)
+        listener.buffer.wait("tool", "camera", timeout_s=DEADLINE_S)
         with pytest.raises(InsertRefused, match="'r1/camera' has the parent 'r1/tool'") as caught:
             statics.set(edge("base", "camera", 2.0))
         assert caught.value.reason == "second parent"
         statics.withdraw("camera")
         statics.set(edge("base", "camera", 2.0))
-        assert listener.buffer.wait("base", "camera", timeout_s=5.0).translation[0] == 2.0
+        assert listener.buffer.wait("base", "camera", timeout_s=DEADLINE_S).translation[0] == 2.0
         assert x_of(listener.buffer, "tool", "camera") is None
         assert listener.stats.refused == {}
 
@@ -171,7 +171,7 @@ def test_edge_that_every_listener_would_refuse_raises_in_set(sessions, parent, c
             assert caught.value.edge == tuple(full)
         else:
             statics.set(edge(parent, child))
-            assert listener.buffer.wait(*full, timeout_s=5.0).kind == "static"
+            assert listener.buffer.wait(*full, timeout_s=DEADLINE_S).kind == "static"
             assert listener.stats.refused == {}
 
 
@@ -182,13 +182,13 @@ def test_edge_of_another_robot_does_not_exclude_the_own_writer(sessions):
         TransformListener(sessions[1]) as listener,
     ):
         thief.set(edge("r2/map", "r1/camera", 9.0))
-        listener.buffer.wait("r2/map", "r1/camera", timeout_s=5.0)
+        listener.buffer.wait("r2/map", "r1/camera", timeout_s=DEADLINE_S)
         mount.set(edge("base", "camera", 1.0))
-        assert listener.buffer.wait("r1/base", "r1/camera", timeout_s=5.0).translation[0] == 1.0
+        assert listener.buffer.wait("r1/base", "r1/camera", timeout_s=DEADLINE_S).translation[0] == 1.0
         assert not listener.buffer.can_lookup("r2/map", "r1/camera")
         until(lambda: listener.stats.refused == {"foreign frame": 1})
         mount.withdraw("camera")
-        assert listener.buffer.wait("r2/map", "r1/camera", timeout_s=5.0).translation[0] == 9.0
+        assert listener.buffer.wait("r2/map", "r1/camera", timeout_s=DEADLINE_S).translation[0] == 9.0
 
 
 def test_map_shared_by_two_robots_is_an_unowned_frame(sessions):
@@ -222,7 +222,7 @@ def test_invalid_frame_name_is_refused_and_earlier_edges_stay(sessions, name: st
         with pytest.raises(InvalidInput, match="frame name"):
             statics.set(Transform("tool", name, (0.0, 0.0, 0.0), UPRIGHT))
         statics.set(edge("tool", "laser"))
-        listener.buffer.wait("camera", "laser", timeout_s=5.0)
+        listener.buffer.wait("camera", "laser", timeout_s=DEADLINE_S)
 
 
 def test_model_writer_name_is_reserved_and_an_invalid_one_refused(sessions):
@@ -270,8 +270,8 @@ def test_full_names_join_two_robots_in_one_buffer(sessions):
         first.set(edge("odom", "base", 2.0))
         second.set(edge("odom", "base", 20.0))
         buffer = listener.buffer
-        assert buffer.wait("map", "r1/base", timeout_s=5.0).translation[0] == 3.0
-        assert buffer.wait("fleet/map", "r2/base", timeout_s=5.0).translation[0] == 30.0
+        assert buffer.wait("map", "r1/base", timeout_s=DEADLINE_S).translation[0] == 3.0
+        assert buffer.wait("fleet/map", "r2/base", timeout_s=DEADLINE_S).translation[0] == 30.0
         assert buffer.lookup("r1/base", "r2/base").translation[0] == 27.0
         assert listener.robots() == ("fleet", "r1", "r2")
 
@@ -288,7 +288,7 @@ def test_publishers_without_a_name_coexist_in_one_process(sessions, monkeypatch:
         assert one.writer.startswith("my%20camera.")
         one.set(edge("tool", "camera", 1.0))
         other.set(edge("tool", "laser", 5.0))
-        assert listener.buffer.wait("camera", "laser", timeout_s=5.0).translation[0] == 4.0
+        assert listener.buffer.wait("camera", "laser", timeout_s=DEADLINE_S).translation[0] == 4.0
 
 
 def test_closed_static_publisher_raises_closed_and_closes_twice(sessions):

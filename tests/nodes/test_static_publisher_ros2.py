@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.raw_ros_nodes import (
     HUMBLE,
     TF_STATIC,
@@ -34,11 +34,11 @@ def test_ros_static_edges_of_several_writers_accumulate_and_none_is_withdrawn(se
         mount.edge(0, "tool", "camera", 1.0)
         mount.edge(0, "tool", "laser", 2.0)
         room.edge(0, "map", "tool", 4.0)
-        assert listener.buffer.wait("map", "laser", timeout_s=5.0).translation[0] == 6.0
+        assert listener.buffer.wait("map", "laser", timeout_s=DEADLINE_S).translation[0] == 6.0
         until(lambda: x_of(listener, "map", "camera") == 5.0)
         until(lambda: writers(listener) == {"camera": "/mount", "laser": "/mount", "tool": "/room"})
         mount.edge(0, "base", "camera", 8.0)
-        assert listener.buffer.wait("base", "camera", timeout_s=5.0).translation[0] == 8.0
+        assert listener.buffer.wait("base", "camera", timeout_s=DEADLINE_S).translation[0] == 8.0
         mount.close()
         room.edge(0, "map", "tool", 5.0)
         until(lambda: x_of(listener, "map", "laser") == 7.0)
@@ -70,9 +70,9 @@ def test_late_listeners_get_the_last_message_of_every_static_writer(sessions):
     humble.edge(0, "map", "humble", 9.0)
     with TransformListener(reader, "r1", wire="ros2") as listener:
         for number in range(5):
-            pose = listener.buffer.wait("map", f"frame_{number}", timeout_s=5.0)
+            pose = listener.buffer.wait("map", f"frame_{number}", timeout_s=DEADLINE_S)
             assert pose.translation[0] == float(number)
-        assert listener.buffer.wait("map", "humble", timeout_s=5.0).translation[0] == 9.0
+        assert listener.buffer.wait("map", "humble", timeout_s=DEADLINE_S).translation[0] == 9.0
 
 
 def test_newest_message_of_two_static_writers_is_used(sessions):
@@ -97,19 +97,19 @@ def test_fixed_edges_of_the_model_are_no_second_writer_in_any_order(sessions, or
         statics = RosNode(writer, "robot_state_publisher").publisher(TF_STATIC).announce()
         if order == "model first":
             publish_description(writer)
-            listener.buffer.wait("lower", "tool", timeout_s=5.0)
+            listener.buffer.wait("lower", "tool", timeout_s=DEADLINE_S)
         statics.transforms(0, [*FIXED, ("tool", "camera")], [*FIXED.values(), moved(0.5)])
         if order == "statics first":
-            listener.buffer.wait("tool", "camera", timeout_s=5.0)
+            listener.buffer.wait("tool", "camera", timeout_s=DEADLINE_S)
         if order != "model first":
             publish_description(writer)
         driver = publish_known_joints(writer, listener)
         driver.joints(STAMP, NAMES, [0.5, 0.25])
-        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
-        assert listener.buffer.wait("tool", "camera", timeout_s=5.0).translation[0] == 0.5
+        assert listener.buffer.wait("tool", "camera", timeout_s=DEADLINE_S).translation[0] == 0.5
         statics.transforms(0, [*FIXED, ("tool", "mark")], [*FIXED.values(), moved(1.5)])
-        listener.buffer.wait("tool", "mark", timeout_s=5.0)
+        listener.buffer.wait("tool", "mark", timeout_s=DEADLINE_S)
         assert listener.stats.refused == {}
 
 
@@ -121,7 +121,7 @@ def test_static_edge_that_contradicts_the_model_is_counted_in_either_order(sessi
         statics = RosNode(writer, "wrong").publisher(TF_STATIC).announce()
         if model_first:
             publish_description(writer)
-            listener.buffer.wait(*edge, timeout_s=5.0)
+            listener.buffer.wait(*edge, timeout_s=DEADLINE_S)
         statics.edge(0, *edge, 9.0)
         if not model_first:
             until(lambda: x_of(listener, *edge) == 9.0)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.processes import SteppingClock, until
+from helpers.processes import DEADLINE_S, SteppingClock, until
 from helpers.recording_builder import (
     LATENCY,
     MS,
@@ -338,7 +338,7 @@ def test_robot_without_a_model_is_published_unchanged(sessions, tmp_path: Path):
         wait_for_stream_readers(writer, "cart", "tf")
         with Player(writer, path, rate=math.inf) as replayer:
             assert replayer.run().samples == 20
-        found = listener.buffer.wait("map", "base", START + 55 * MS, timeout_s=5.0)
+        found = listener.buffer.wait("map", "base", START + 55 * MS, timeout_s=DEADLINE_S)
         expected = recorded_buffer(path).lookup("map", "base", START + 55 * MS)
     assert np.array_equal(found.pose7, expected.pose7)
     samples = [decode(p, encoding_of(TransformSample), TransformSample) for p in tap.payloads(20)]
@@ -410,7 +410,7 @@ def test_model_replaced_in_the_recording_is_replaced_in_playback(sessions, tmp_p
             assert replayer.run().samples == 20
         until(lambda: listener.stats.received == 20)
         # Models come apart from samples, and between two of them there is none.
-        until(lambda: listener.buffer.wait("lower", "tool", timeout_s=5.0).translation[2] == 0.9)
+        until(lambda: listener.buffer.wait("lower", "tool", timeout_s=DEADLINE_S).translation[2] == 0.9)
     known = recorded_buffer(tmp_path / "r.mcap")
     assert known.lookup("lower", "tool").translation[2] == 0.9
 

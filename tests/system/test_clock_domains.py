@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.recording_builder import START, RecordingBuilder
 from helpers.robots import RRBOT, wait_for_reader, wait_for_stream_readers
 
@@ -71,8 +71,8 @@ def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_them_raises_clock
         until(lambda: (domain_of("r1"), domain_of("r2")) == ("system", "sim"))
         for robot in (virtual, real):
             robot.publish([0.5, 0.5])
-        assert buffer.wait("map", "r1/tool", timeout_s=5.0).stamp == NOW
-        assert buffer.wait("map", "r2/tool", timeout_s=5.0).stamp == 5 * SECOND
+        assert buffer.wait("map", "r1/tool", timeout_s=DEADLINE_S).stamp == NOW
+        assert buffer.wait("map", "r2/tool", timeout_s=DEADLINE_S).stamp == 5 * SECOND
         with pytest.raises(ClockMismatch) as caught:
             buffer.lookup("r1/tool", "r2/tool")
         assert listener.stats.refused == {}
@@ -196,7 +196,7 @@ def test_robot_may_change_its_clock(sessions):
         with StatePublisher(writer, RRBOT, "r1") as real:
             wait_for_stream_readers(writer, "r1")
             real.publish([0.5, 0.5])
-            listener.buffer.wait("world", "tool", timeout_s=5.0)
+            listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         with StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual:
             wait_for_stream_readers(writer, "r1")
             virtual.publish([0.5, 0.5])
@@ -214,7 +214,7 @@ def test_age_limit_of_another_clock_is_an_error_naming_both(sessions, follow):
     ):
         wait_for_stream_readers(writer, "r1", follow)
         virtual.publish([0.5, 0.5])
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         until(lambda: feed_of(listener.buffer).domain.domain_of("r1") == "sim")
         for timeout_s in (0.0, 60.0):  # the given clock does not change, so waiting is no use
             with pytest.raises(ClockMismatch, match="max_age_s is measured by a clock of 'system'") as caught:
@@ -246,7 +246,7 @@ def test_sample_85_us_back_is_sorted_in_without_a_restart(sessions, caplog, foll
             clock.set(stamp)
             publisher.publish([0.1 * number, 0.0])
         until(lambda: listener.stats.received == 4)
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         for stamp in stamps:
             assert listener.buffer.lookup("world", "tool", stamp).kind == "exact"
         stats = listener.stats
@@ -280,7 +280,7 @@ def test_clock_an_hour_ahead_and_back_is_logged_and_followed_without_effect_on_o
         until(lambda: listener.stats.received == 1)
         publish(NOW)
         until(lambda: feed_of(buffer).domain.domain_of("r1") == "system")
-        buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        buffer.wait("r1/world", "r1/tool", timeout_s=DEADLINE_S)
         publish(NOW + HOUR)
         publish(NOW + HOUR + MS)
         assert buffer.latest("r1/world", "r1/tool") == NOW + HOUR + MS
@@ -320,7 +320,7 @@ def test_clock_set_back_by_less_than_the_history_starts_a_new_history_of_that_ro
             clock.set(NOW + stamp * MS)
             stepping.publish([0.1 * number, 0.0])
         until(lambda: listener.stats.received == 8)
-        buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        buffer.wait("r1/world", "r1/tool", timeout_s=DEADLINE_S)
         assert buffer.latest("r1/world", "r1/tool") == NOW - 4_980 * MS
         assert not buffer.can_lookup("r1/world", "r1/tool", NOW)
         assert buffer.can_lookup("r2/world", "r2/tool", NOW)
@@ -381,7 +381,7 @@ def test_restarted_simulation_is_a_new_epoch_at_its_second_sample(sessions, foll
             clock.set(stamp)
             publisher.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 5)
-        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert listener.buffer.latest("world", "tool") == 10 * MS
         assert not listener.buffer.can_lookup("world", "tool", 4 * SECOND)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
-from helpers.processes import repeated, until
+from helpers.processes import DEADLINE_S, repeated, until
 from helpers.robots import RRBOT, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
@@ -105,4 +105,4 @@ def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
         wait_for_stream_readers(writer, "r1")
         publisher.publish([0.5, 0.5])
         # What was latched before still holds: the value was not withdrawn.
-        listener.buffer.wait("r1/world", "r1/camera", timeout_s=5.0)
+        listener.buffer.wait("r1/world", "r1/camera", timeout_s=DEADLINE_S)

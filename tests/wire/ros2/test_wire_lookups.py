@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.manual_cdr import rosbags_joint_state, rosbags_tf_message
 from helpers.model_samples import every_joint, random_positions
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.raw_ros_nodes import (
     JOINT_STATES,
     TF,
@@ -178,9 +178,9 @@ def test_behind_a_bridge_robots_are_followed_and_their_writers_named(sessions):
         wait_for_reader(writer, "tf")
         until(lambda: len(discover(reader, wire="ros2dds")) == 1)
         publisher.publish([0.5, 0.25], stamp=STAMP)
-        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        pose = listener.buffer.wait("world", "tool", timeout_s=DEADLINE_S)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
-        assert listener.buffer.wait("tool", "camera", timeout_s=5.0).translation[0] == 0.5
+        assert listener.buffer.wait("tool", "camera", timeout_s=DEADLINE_S).translation[0] == 0.5
         expected = f"ros2dds bridge {writer.zid[:8]}"
         until(
             lambda: (
