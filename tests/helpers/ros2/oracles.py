@@ -124,6 +124,7 @@ def _mend_exports(folder: Path, python: Path) -> None:
         mended = re.sub(r'/opt/python/[^;"]*/numpy/_core/include', numpy, text)
         mended = re.sub(r'/opt/python/[^;"]*/include/python3\.\d+', sysconfig.get_path("include"), mended)
         if mended != text:
+            file.unlink()  # it may be one file with that in uv's cache, which others install from
             file.write_text(mended)
 
 
