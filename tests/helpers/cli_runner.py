@@ -25,9 +25,9 @@ import click.formatting
 import pytest
 from click.testing import CliRunner
 from helpers.fork_server import ForkedProcess, server
-from helpers.processes import DEADLINE_S, ZENOH_CLOSE_S, Child
+from helpers.processes import DEADLINE_S, ZENOH_CLOSE_S, Child, until
 
-from zstate import StatePublisher, Transform, TransformListener, connect, load_model
+from zstate import StatePublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.cli.main import _end, run
 from zstate.cli.output import logs
 from zstate.clock import Clock
@@ -37,14 +37,12 @@ RRBOT = str(Path(__file__).parents[2] / "models" / "rrbot.urdf")
 ALL_STREAMS: tuple[StreamName, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 SHOULDER, ELBOW = 0.5, -0.2
 
-ROVER = """
+_ROVER = """
 from zstate import connect
 from zstate.odometry.cli.rover import run_rover
 with connect() as session:
-    print("ready")
     run_rover(session, 100.0)
 """
-"""The program with the hardware of `zstate demo rover`, on the test's network."""
 
 MAIN = "from zstate.cli.main import main; main()"
 """The program ``zstate``, as code."""
@@ -250,6 +248,13 @@ def started(spawn: Spawn, *arguments: str) -> Child:
     """A command that runs until it is stopped: a process, forked from one that has imported zstate."""
     imports = _IMPORTS.get(arguments[0], ())
     return spawn(MAIN, *arguments, imports=imports)
+
+
+def start_rover(spawn: Spawn) -> None:
+    """Start the hardware of `zstate demo rover`, on the test's network, and wait until it is announced."""
+    spawn(_ROVER)
+    with connect() as session:
+        until(lambda: any(one.name == "rover" and one.named("imu") for one in discover(session)))
 
 
 @contextmanager

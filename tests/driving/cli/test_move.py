@@ -15,7 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.cli_runner import ROVER, Command, Spawn, failure, interrupted, run_cli, run_watched, started
+from helpers.cli_runner import (
+    Command,
+    Spawn,
+    failure,
+    interrupted,
+    run_cli,
+    run_watched,
+    start_rover,
+    started,
+)
 from helpers.processes import DEADLINE_S, Child, repeated, until
 from helpers.programs import driver
 
@@ -254,7 +263,7 @@ def rates_of(joints: JointStateListener) -> Callable[[], np.ndarray]:
 
 @pytest.mark.processes
 def test_wheels_turn_while_a_key_is_held_and_stop_at_once_at_another_one(spawn: Spawn):
-    assert spawn(ROVER).line() == "ready"
+    start_rover(spawn)
     with (
         connect() as session,
         JointStateListener(session, "rover") as joints,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.cli_runner import ROVER, Spawn, failure, run_cli, run_until
+from helpers.cli_runner import Spawn, failure, run_cli, run_until, start_rover
 from helpers.recording_builder import MS, START, RecordingBuilder
 
 from zstate import Transform, TransformBuffer, load_model
@@ -33,7 +33,7 @@ GYRO, ACCEL = 3e-4, 4e-3
 @pytest.mark.processes
 @pytest.mark.long
 def test_first_file_of_a_rover_at_rest_has_its_wheels_and_noise_and_runs(spawn: Spawn, tmp_path: Path):
-    assert spawn(ROVER).line() == "ready"
+    start_rover(spawn)
     file = tmp_path / "rover.toml"
     ended = run_cli("odometry", "rover", "--init", str(file), "--seconds", "3")
     run = f"zstate odometry rover --file {file}"

@@ -11,7 +11,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import ROVER, Spawn, failure, found_pose, interrupted, run_cli, run_until, started
+from helpers.cli_runner import (
+    Spawn,
+    failure,
+    found_pose,
+    interrupted,
+    run_cli,
+    run_until,
+    start_rover,
+    started,
+)
 from helpers.processes import DEADLINE_S, repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
@@ -33,7 +42,7 @@ SETTINGS = str(Path(__file__).parents[3] / "models" / "rover.toml")
 def test_live_odometry_drives_the_rover_and_its_recording_gives_a_report_and_a_plot(
     spawn: Spawn, tmp_path: Path
 ):
-    assert spawn(ROVER).line() == "ready"
+    start_rover(spawn)
     live = started(spawn, "odometry", "rover", "--file", SETTINGS, "--rate", "50")
     first = (
         "publishing the odometry of 'rover', odom -> base_footprint, as 'odometry', from its IMU 'imu', its "
