@@ -57,6 +57,10 @@ REQUIREMENTS = {
         lambda: Path(CHROMIUM).exists() and importlib.util.find_spec("playwright") is not None,
         "apt-get install chromium-headless-shell fonts-dejavu-core",
     ),
+    "gcc": Requirement(
+        lambda: has_programs("gcc") and Path("/usr/include/linux/videodev2.h").exists(),
+        "apt-get install gcc libc6-dev",
+    ),
     "shells": Requirement(lambda: has_programs("zsh", "fish"), "apt-get install zsh fish"),
     "netns": Requirement(
         lambda: has_programs("nft") and can_create_namespaces(),

@@ -85,9 +85,13 @@ class BackgroundCall(Generic[Result]):
 
         threading.Thread(target=run, name=name, daemon=True).start()
 
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until it has ended, at most ``timeout_s`` [s]; whether it has."""
+        return wait_interruptible(self._is_done, timeout_s)
+
     def result(self, timeout_s: float | None = None) -> Result:
         """The value that ``work`` returned, or its exception. Raises TimeoutError after ``timeout_s``."""
-        if not wait_interruptible(self._is_done, timeout_s):
+        if not self.wait(timeout_s):
             raise TimeoutError(f"the work took longer than {timeout_s} s")
         return self._outcome.result()
 

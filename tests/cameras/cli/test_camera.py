@@ -80,9 +80,13 @@ def test_no_source_and_two_of_them_are_wrong_usage(tmp_path: Path):
     for arguments in ((), (video, "--device", "/dev/video0"), (video, "--simulate")):
         text = failure("camera", "r1", *arguments, code=2)
         assert "give --device /dev/videoN, a video FILE or --simulate, one of them" in text
-    for option in (("--rate", "5"), ("--world-frame", "map")):
-        text = failure("camera", "r1", video, *option, code=2)
-        assert "--rate and --world-frame are for --simulate" in text
+    for option, sources in (
+        (("--rate", "5"), "--simulate or --device"),
+        (("--world-frame", "map"), "--simulate"),
+        (("--size", "64", "48"), "--device"),
+    ):
+        assert f"{option[0]} is for {sources}" in failure("camera", "r1", video, *option, code=2)
+    assert "--loop is for FILE" in failure("camera", "r1", "--simulate", "--loop", code=2)
 
 
 @pytest.mark.processes

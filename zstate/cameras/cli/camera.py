@@ -15,7 +15,7 @@ from zstate.cli.session import SessionOptions, open_session
 if TYPE_CHECKING:
     from zstate.buffer.buffer import TransformBuffer
     from zstate.cameras import Camera, CameraPublisher
-    from zstate.cameras.video_source import VideoSource
+    from zstate.cameras.cli.video_source import VideoFile, Webcam
     from zstate.net.session import Session
 
 
@@ -36,8 +36,16 @@ class _CameraCommand(click.Command):
         given = [ctx.params["device"] is not None, ctx.params["file"] is not None, ctx.params["simulate"]]
         if sum(given) != 1 and not ctx.resilient_parsing:
             raise click.UsageError("give --device /dev/videoN, a video FILE or --simulate, one of them", ctx)
-        if (ctx.params["rate"] or ctx.params["world_frame"]) and not ctx.params["simulate"]:
-            raise click.UsageError("--rate and --world-frame are for --simulate", ctx)
+        given_for = {
+            "world_frame": ("simulate",),
+            "size": ("device",),
+            "rate": ("simulate", "device"),
+            "loop": ("file",),
+        }
+        for option, sources in given_for.items():
+            if ctx.params[option] and not any(ctx.params[source] for source in sources):
+                wanted = " or ".join("FILE" if source == "file" else f"--{source}" for source in sources)
+                raise click.UsageError(f"--{option.replace('_', '-')} is for {wanted}", ctx)
         return rest
 
 
@@ -70,7 +78,18 @@ class _CameraCommand(click.Command):
     help="With --simulate: the frame in which the floor lies, if the robot has that frame, else the root of "
     "the robot; default: map.",
 )
-@click.option("--rate", type=options.RATE, help="With --simulate: pictures a second; default: 10.")
+@click.option(
+    "--size",
+    type=click.IntRange(min=1),
+    nargs=2,
+    metavar="WIDTH HEIGHT",
+    help="With --device: the size of its pictures [px]; default: what its driver has set.",
+)
+@click.option(
+    "--rate",
+    type=options.RATE,
+    help="Pictures a second; default: with --device what its driver has set, with --simulate 10.",
+)
 @click.option("--loop", is_flag=True, help="Begin FILE again at its end.")
 @options.seconds_option
 @options.wires_option
@@ -85,6 +104,7 @@ def camera_command(
     frame: str | None,
     info: str | None,
     world_frame: str | None,
+    size: tuple[int, int] | None,
     rate: float | None,
     loop: bool,
     seconds: float | None,
@@ -94,7 +114,7 @@ def camera_command(
     """Publish the pictures of a camera of this computer, or of a video FILE, as image/NAME of ROBOT.
 
     The JPEGs of a camera, or of a file of them, are sent as they are; other pictures are encoded as JPEG. A
-    picture of a camera has the stamp of its arrival here, those of a file follow each other as in the file.
+    picture of a camera has the stamp of its driver, those of a file follow each other as in the file.
     Needs pip install 'zstate[cameras]'.
 
     A simulated camera sees the links of ROBOT, by its transforms on the network, and a checkered floor. It
@@ -103,18 +123,23 @@ def camera_command(
 
     \b
     zstate camera r1 --device /dev/video0 --name wrist --frame wrist_optical
-    zstate camera r1 --device /dev/video0 --info wrist.yaml
+    zstate camera r1 --device /dev/video0 --info wrist.yaml --size 1280 720 --rate 30
     zstate camera r1 walk.mp4 --loop
     zstate camera r1 --simulate --frame wrist_optical
     zstate camera r1 walk.mp4 --wire ros2    # /camera/image_raw/compressed, /camera/camera_info
     """
-    from zstate.cameras import load_camera
+    from zstate.cameras import CameraPublisher, load_camera
+    from zstate.cameras.cli.video_source import VideoFile, Webcam
+    from zstate.errors import InvalidInput
     from zstate.wire.keys import check_robot
 
     check_robot(robot)
     camera = None if info is None else load_camera(info, name if frame is None else frame)
-    source_path = device if file is None else file
-    if source_path is None:
+    if device is not None:
+        source = Webcam(device, size, rate)
+    elif file is not None:
+        source = VideoFile(file)
+    else:
         camera = camera or _simulated_lens(name if frame is None else frame)
         with open_session(network, wires) as session:
             _simulate(
@@ -128,30 +153,24 @@ def camera_command(
                 seconds=seconds,
             )
         return
-    from zstate.cameras import CameraPublisher
-    from zstate.cameras.video_source import VideoSource
-    from zstate.errors import InvalidInput
-
-    with (
-        VideoSource(source_path, is_device=file is None) as source,
-        open_session(network, wires) as session,
-    ):
+    with source, open_session(network, wires) as session:
         width, height = source.size
         if camera is not None and source.size != (camera.width, camera.height):
             raise InvalidInput(
-                f"{source_path} has pictures of {width} x {height}, {info} is for {camera.width} x "
+                f"{source.path} has pictures of {width} x {height}, {info} is for {camera.width} x "
                 f"{camera.height}: calibrate the camera at the size that it sends"
             )
         with CameraPublisher(session, robot, name, camera, wires, frame=frame) as publisher:
             form = "JPEG as it comes" if source.codec == "mjpeg" else f"{source.codec}, encoded as JPEG"
             print_wrapped(
-                f"{robot}: {width} x {height} of {source_path}, {form}, in {publisher.frame}, on "
+                f"{robot}: {width} x {height} of {source.path}, {form}, in {publisher.frame}, on "
                 f"{_places(robot, name, wires)}"
             )
             try:
-                _publish(source, publisher, loop=loop, seconds=seconds)
-            except OSError as error:
-                fail(str(error))
+                if isinstance(source, Webcam):
+                    _publish_webcam(source, publisher, seconds)
+                else:
+                    _publish_file(source, publisher, loop=loop, seconds=seconds)
             finally:
                 stats = publisher.stats
                 refused = f", {stats.refused} refused: {stats.last_refusal}" if stats.refused else ""
@@ -220,8 +239,26 @@ def _simulate(
         run_publisher(publisher, source, rate, seconds)
 
 
-def _publish(source: VideoSource, publisher: CameraPublisher, *, loop: bool, seconds: float | None) -> None:
-    """Publish the pictures of ``source``, those of a file at their times, for ``seconds`` or to the end."""
+def _publish_webcam(webcam: Webcam, publisher: CameraPublisher, seconds: float | None) -> None:
+    """Publish the pictures of ``webcam`` for ``seconds``; fail if it sends no more."""
+    from contextlib import suppress
+
+    from zstate.clock import SystemClock
+    from zstate.errors import InvalidInput
+
+    end = None if seconds is None else SystemClock().now() + round(seconds * 1e9)
+    try:
+        for stamp, picture in webcam.pictures():
+            if end is not None and stamp >= end:
+                return
+            with suppress(InvalidInput):  # a broken picture; the publisher counts it
+                publisher.publish(picture, stamp)
+    except OSError as error:
+        fail(str(error))
+
+
+def _publish_file(file: VideoFile, publisher: CameraPublisher, *, loop: bool, seconds: float | None) -> None:
+    """Publish the pictures of ``file`` at their times, for ``seconds`` or to its end."""
     from contextlib import suppress
 
     from zstate.clock import SystemClock, wait_interruptible
@@ -232,17 +269,17 @@ def _publish(source: VideoSource, publisher: CameraPublisher, *, loop: bool, sec
     end = None if seconds is None else start + round(seconds * 1e9)
     while True:
         stamp = before = None
-        for at_s, picture in source.pictures():
+        for at_s, picture in file.pictures():
             now = clock.now()
-            before, stamp = stamp, now if source.is_device else start + round(at_s * 1e9)
+            before, stamp = stamp, start + round(at_s * 1e9)
             if end is not None and max(stamp, now) >= end:
                 return
             wait_interruptible(never, max(stamp - now, 0) * 1e-9)
-            with suppress(InvalidInput):  # one broken picture of a camera; the publisher counts it
+            with suppress(InvalidInput):  # a broken picture; the publisher counts it
                 publisher.publish(picture, stamp)
         if stamp is None:
-            fail(f"there is no picture in {source.path}")
+            fail(f"there is no picture in {file.path}")
         if not loop:
             return
-        source.rewind()
+        file.rewind()
         start = stamp + (_SINGLE_PICTURE_NS if before is None else stamp - before)
