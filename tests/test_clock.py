@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from helpers.processes import DEADLINE_S
 
-from zstate.clock import ManualClock, SystemClock, check_stamp, format_stamp, wait_interruptible
+from zstate.clock import ManualClock, StopEvent, SystemClock, check_stamp, format_stamp, wait_interruptible
 from zstate.errors import InvalidInput
 
 
@@ -90,3 +93,53 @@ def test_waiting_in_slices_ends_when_the_event_is_set_or_the_time_is_up() -> Non
     threading.Timer(0.01, event.set).start()
     assert wait_interruptible(event)
     assert wait_interruptible(event, -1.0)
+
+
+def interrupt(work: Callable[[], object], *, at: int) -> bool:
+    """Raise KeyboardInterrupt at step ``at`` of ``work``, as a signal's handler may; whether it has one."""
+    steps = 0
+
+    def trace(*_: object) -> Callable[..., object]:
+        nonlocal steps
+        steps += 1
+        if steps == at:
+            raise KeyboardInterrupt
+        return trace
+
+    sys.settrace(trace)
+    try:
+        work()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(None)
+    return False
+
+
+def test_a_stop_event_outlives_an_interrupt_at_any_step_of_its_wait() -> None:
+    at, was_interrupted = 0, True
+    while was_interrupted:
+        stop, at = StopEvent(), at + 1
+        was_interrupted = interrupt(lambda: wait_interruptible(stop, 0.001), at=at)  # noqa: B023 - at once
+        setter = threading.Thread(target=stop.set, daemon=True)
+        setter.start()
+        setter.join(DEADLINE_S)
+        assert not setter.is_alive()
+        assert stop.wait(0.0)
+    assert at > 5
+
+
+def test_a_set_stop_event_ends_the_waits_of_all_threads() -> None:
+    stop = StopEvent()
+    waits = [
+        threading.Thread(target=stop.wait, args=(within_s,), daemon=True) for within_s in (None, None, 60.0)
+    ]
+    for wait in waits:
+        wait.start()
+    assert not stop.wait(0.001)
+    stop.set()
+    stop.set()
+    for wait in waits:
+        wait.join(DEADLINE_S)
+        assert not wait.is_alive()
+    assert stop.wait()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
-from zstate.clock import Clock, SystemClock
+from zstate.clock import Clock, StopEvent, SystemClock
 from zstate.errors import Closed
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, RefusalCount, StreamStats
@@ -32,7 +31,7 @@ class SamplePublisher(Closeable):
         self._limits: LimitWatch | None = None
         self._refusals = RefusalCount()
         self._rate: Rate | None = None
-        self._stop = fork_safe(threading.Event())
+        self._stop = fork_safe(StopEvent())
 
     @property
     def stats(self) -> PublisherStats:

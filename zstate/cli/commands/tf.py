@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
-from threading import Event
 from typing import TYPE_CHECKING
 
 import click
@@ -105,7 +104,7 @@ def tf_command(
     zstate tf base_link tool0 --wire ros2              # reads /tf and /tf_static
     """
     from zstate.cli.waiting import PoseWaiter
-    from zstate.clock import SystemClock
+    from zstate.clock import StopEvent, SystemClock
     from zstate.ingest.deadline import Deadline
     from zstate.nodes.listener import TransformListener
     from zstate.rate import Rate
@@ -161,7 +160,7 @@ def tf_command(
             return
         shown: Transform | None = None
         deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
-        for _ in Rate(rate, SystemClock(), Event(), seconds):
+        for _ in Rate(rate, SystemClock(), StopEvent(), seconds):
             transform = waiter.wait(timeout_s=seconds)
             if transform != shown:
                 show(transform)
