@@ -32,7 +32,7 @@ def transform_events(reader: FaultProcess) -> list[str]:
 
 
 def await_known_rate(reader: FaultProcess) -> None:
-    """Wait for a hundred samples: a writer of few, with a pause between, may be silent for as long again."""
+    """Wait for a hundred samples: with few and a pause between, ten such pauses are no silence yet."""
     until(lambda: reader.query("odometry count", "r1") >= 100)
 
 
