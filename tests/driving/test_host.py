@@ -1045,6 +1045,23 @@ def test_a_signal_that_ends_the_program_stops_and_closes_the_driver_first(
     assert child.process.wait(DEADLINE_S) == -number
 
 
+def test_the_loop_waits_for_no_lock_that_ctrl_c_could_leave_held(sessions, monkeypatch: pytest.MonkeyPatch):
+    """Condition.wait is Python, and KeyboardInterrupt at some of its steps would hang ``close``."""
+    waits: list[float | None] = []
+    wait = threading.Condition.wait
+
+    def watched(condition: threading.Condition, timeout: float | None = None) -> bool:
+        if threading.current_thread() is threading.main_thread():
+            waits.append(timeout)
+        return wait(condition, timeout)
+
+    with DriverHost(sessions[0], RecordingDriver(), RRBOT, "arm", rate_hz=RATE_HZ, limits=LIMITS) as host:
+        monkeypatch.setattr(threading.Condition, "wait", watched)
+        assert host.run(seconds=0.1).rate.ticks > 0
+        monkeypatch.undo()
+    assert waits == []
+
+
 def test_close_in_a_handler_of_a_signal_during_close_does_not_wait_for_itself(spawn):
     child = spawn(
         REPORTING_HOST

@@ -22,6 +22,7 @@ from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe
 from zstate._util.refusals import Refusals
+from zstate.clock import StopEvent
 from zstate.driving.commands import CommandReceiver
 from zstate.driving.control_loop import ControlLoop, StateName
 from zstate.driving.driver import Driver, StopMode
@@ -141,7 +142,7 @@ class DriverHost(Closeable):
         """Announced commanders by session."""
         self._lateness = Durations()
         self._rate: Rate | DevicePace | None = None
-        self._stop = fork_safe(threading.Event())
+        self._stop = fork_safe(StopEvent())
         self._is_ending = False
         self._running = fork_safe(threading.RLock())
         """Held by ``run`` and ``close``; a handler of a signal may call ``close`` inside both."""
